@@ -169,6 +169,7 @@ def edit(
         guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
+        from attnwarp.fit import read_exposures
         from attnwarp.io.file import existing_file
         from attnwarp.methods.change import say_change, say_drift, say_little
         from attnwarp.methods.command import (
@@ -230,7 +231,8 @@ def edit(
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(**{k: v for k, v in planned.items() if v is not None}),
-            notes=notes, origin=origin, budget=budget, asked=asked, report=report, **own,
+            notes=notes, origin=origin, exposures={} if ply is None else read_exposures(ply),
+            budget=budget, asked=asked, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         if little := say_little(result.change):

@@ -165,7 +165,7 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
     near = near_of(dataset.cameras, splats)
     error = spread = 0.0
     count = 0
-    for camera, image in zip(views.cameras, views.images, strict=True):
+    for camera, image, kept in zip(views.cameras, views.images, views.masks, strict=True):
         with torch.no_grad():
             view = render(splats, camera, near=near)
         alpha = view.alpha.numpy()
@@ -174,6 +174,8 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
         shown = alpha > 0.5
         if image.shape[2] == 4:
             shown &= colors[..., 3] > 0.5
+        if kept is not None:
+            shown &= kept
         if not shown.any():
             continue
         true = colors[shown, :3]

@@ -56,7 +56,7 @@ PIXELS_PER_SPLAT, GROWTH = 2, 2
 ones if more."""
 
 
-RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
+RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json", "exposures.json")
 """Files of a fit, in addition to ``held_out``."""
 
 
@@ -262,16 +262,17 @@ def _fit(
         raise ValueError(
             f"{error} (--restart does so; --start SPLATS.ply goes on from splats in another folder)"
         ) from error
-    _write_results(out, result, held_out)
+    _write_results(out, result, views, held_out)
     return result
 
 
-def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
-    """Write the settings, the history, and the held-out views with their pictures; print each
-    view's distance from its picture.
+def _write_results(out: Path, result: Fit, views: Views, held_out: Views | None) -> None:
+    """Write the settings, the history, the exposures, and the held-out views with their pictures;
+    print each view's distance from its picture.
     """
     from dataclasses import asdict
 
+    from attnwarp.fit.exposure import write_exposures
     from attnwarp.io.file import write_atomically
     from attnwarp.io.names import file_stems
 
@@ -286,6 +287,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     )
     write_atomically(out / "history.jsonl", lambda stream: stream.write(lines.encode()))
     write_atomically(out / "settings.json", lambda stream: stream.write(f"{settings}\n".encode()))
+    write_exposures(out, views.cameras, result.exposures)
     if held_out is None:
         return
 

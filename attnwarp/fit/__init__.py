@@ -2,6 +2,7 @@
 docs/method/fitting.md.
 """
 
+from attnwarp.fit.exposure import read_exposures
 from attnwarp.fit.loop import Fit, Record, fit
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.sky import with_sky
@@ -22,5 +23,6 @@ __all__ = [
     "hold_out",
     "load_views",
     "random_points",
+    "read_exposures",
     "with_sky",
 ]

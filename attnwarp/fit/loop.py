@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from attnwarp import check, losses
@@ -96,6 +97,8 @@ class Fit:
         stopped: reason of the end: "iterations" (all done), "time", "patience", or "asked".
         extent: extent of the scene, the unit of the settings' shares.
         kept: evaluation of the returned splats.
+        exposures: (3, 4) change of colour of each fitted view, for
+            :class:`attnwarp.fit.Views`; empty unless the settings estimate exposure.
 
     Example:
         >>> import numpy as np
@@ -117,6 +120,7 @@ class Fit:
     stopped: str
     extent: float
     kept: Record
+    exposures: list[npt.NDArray[np.float32]] = field(default_factory=list)
 
 
 @on_cpu_unless_named
@@ -399,6 +403,7 @@ class _Run:
             self.evaluate()
         gaussians = self.model.gaussians(self.best or None).detach()
         self.save(gaussians)
+        changes = (self.best or self._snapshot()).get("exposures")
         return Fit(
             gaussians,
             s,
@@ -409,7 +414,14 @@ class _Run:
             stopped,
             self.extent,
             max(self.history, key=_chosen) if self.chooses else self.history[-1],
+            [] if changes is None else list(changes.cpu().numpy()),
         )
+
+    def _snapshot(self) -> dict[str, Tensor]:
+        """Copy the splats' leaves, and the exposures."""
+        if self.exposure is None:
+            return self.model.snapshot()
+        return {**self.model.snapshot(), "exposures": self.exposure.changes().detach()}
 
     def announce(self, report: Reporter) -> None:
         """Tell the expected time, from the pace of three iterations that change nothing."""
@@ -507,13 +519,9 @@ class _Run:
                 f"after {self.iteration} iterations: {error}; lower the learning rates"
             ) from error
         view = self.render(gaussians, camera, background)
-        image = view.color.float()
-        if self.exposure is not None:
-            image = self.exposure(image, index)
-        kept = self.views.kept(index, image.device)
-        if kept is not None:
-            # Black in both, since SSIM also reads the neighbours of a pixel.
-            image, target = image * kept[..., None], target * kept[..., None]
+        expose = self.views.exposed if self.exposure is None else self.exposure
+        image = self.views.masked(index, expose(index, view.color.float()))
+        target = self.views.masked(index, target)
         loss = self.loss_of(image, view, target)
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -588,7 +596,7 @@ class _Run:
             measures=dict(self.measure(gaussians)) if self.measure else {},
         )
         if choosing and _chosen(record) > max(map(_chosen, self.history), default=-math.inf):
-            self.best = self.model.snapshot()
+            self.best = self._snapshot()
         self.history.append(record)
 
 

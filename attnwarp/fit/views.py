@@ -7,10 +7,11 @@ import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -77,7 +78,7 @@ class Drawn(Sequence[S]):
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Posed pictures.
+    """Posed pictures, which a fit or an edit tunes splats on.
 
     Args:
         cameras: cameras, one for each picture, at least one.
@@ -85,6 +86,8 @@ class Views:
             uint16, or floating in [0, 1]. Their type is kept: 8 bits take a quarter of the
             memory.
         masks: (H, W) bool, one for each picture or None; False where the picture is to be ignored.
+        exposures: (3, 4) changes of colour [A b], one for each picture or None: of a surface that
+            renders as c, the picture shows c + A c + b. See :attr:`attnwarp.fit.Fit.exposures`.
 
     Attributes:
         transparent: True if any picture has non-opaque pixels.
@@ -104,6 +107,7 @@ class Views:
     cameras: Sequence[Camera]
     images: Sequence[npt.NDArray[Any]]
     masks: Sequence[npt.NDArray[np.bool_] | None] = ()
+    exposures: Sequence[npt.NDArray[np.floating[Any]] | None] = ()
     transparent: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -113,9 +117,17 @@ class Views:
             raise ValueError(
                 f"images: got {len(self.images)}, expected {len(self.cameras)}, as cameras"
             )
-        masks = list(self.masks) or [None] * len(self.cameras)
-        object.__setattr__(self, "masks", masks)
-        for camera, mask in zip(self.cameras, masks, strict=True):
+        for name in ("masks", "exposures"):
+            values = list(getattr(self, name)) or [None] * len(self.cameras)
+            if len(values) != len(self.cameras):
+                raise ValueError(
+                    f"{name}: got {len(values)}, expected {len(self.cameras)}, as cameras"
+                )
+            object.__setattr__(self, name, values)
+        for camera, mask, change in zip(self.cameras, self.masks, self.exposures, strict=True):
+            if change is not None:
+                check.shape(change, (3, 4), f"exposure of {camera.name}")
+                check.finite(change, f"exposure of {camera.name}")
             if mask is not None:
                 check.shape(mask, (camera.height, camera.width), f"mask of {camera.name}")
                 if not mask.any():
@@ -123,8 +135,7 @@ class Views:
                         f"masks: that of {camera.name} ignores the whole picture; leave it out"
                     )
         if not isinstance(self.images, Drawn):
-            arrays = [i.numpy() if isinstance(i, torch.Tensor) else i for i in self.images]
-            object.__setattr__(self, "images", arrays)
+            object.__setattr__(self, "images", [np.asarray(image) for image in self.images])
         transparent = False
         for i, (camera, image) in enumerate(zip(self.cameras, self.images, strict=True)):
             name = f"images[{i}] ({camera.name})"
@@ -137,10 +148,8 @@ class Views:
                     f"{name}: got {image.shape[1]} x {image.shape[0]} px, its camera has "
                     f"{camera.width} x {camera.height}; resize one of them"
                 )
-            if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-                raise ValueError(
-                    f"{name}: got {image.dtype}, expected uint8, uint16, float32 or float64"
-                )
+            if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
+                raise ValueError(f"{name}: got {image.dtype}, expected uint8, uint16 or floating")
             if image.dtype.kind == "f":
                 check.finite(image, name)
                 if image.min() < 0 or image.max() > 1:
@@ -152,6 +161,14 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def picture(self, index: int) -> npt.NDArray[np.float32]:
+        """Return a (H, W, 3) float32 picture in [0, 1], over black, without a copy of a float32
+        one that torch can share."""
+        image = self.images[index]
+        if image.shape[2] == 4:
+            return np.asarray(self.target(index, torch.zeros(3, dtype=torch.float32)))
+        return to_float(image)
 
     def target(self, index: int, background: check.Array) -> torch.Tensor:
         """Return a (H, W, 3) float32 picture in [0, 1], composited over ``background`` (3,), on the
@@ -171,6 +188,19 @@ class Views:
         """Return a picture's mask on a device, (H, W) bool, False where the picture is ignored."""
         mask = self.masks[index]
         return None if mask is None else torch.from_numpy(np.asarray(mask, bool)).to(device)
+
+    def masked(self, index: int, picture: torch.Tensor) -> torch.Tensor:
+        """Black out what a picture's mask ignores of a (H, W, 3) render or picture. Losses of both
+        then ignore it, also SSIM, which reads a pixel's neighbours."""
+        kept = self.kept(index, picture.device)
+        return picture if kept is None else picture * kept[..., None]
+
+    def exposed(self, index: int, color: torch.Tensor) -> torch.Tensor:
+        """Change a render (H, W, 3) as a picture was exposed."""
+        change = self.exposures[index]
+        if change is None:
+            return color
+        return expose(color, torch.from_numpy(np.asarray(change)).to(color))
 
     def error(self, index: int, image: torch.Tensor, background: torch.Tensor) -> float:
         """Mean squared error of a render (H, W, 3) against a picture, where that is not ignored;
@@ -203,7 +233,21 @@ class Views:
             total.update(json.dumps(spec, sort_keys=True).encode())
             total.update(np.ascontiguousarray(image).tobytes())
             total.update(b"" if mask is None else np.packbits(mask).tobytes())
+        for change in self.exposures:
+            total.update(b"" if change is None else np.asarray(change, np.float64).tobytes())
         return total.hexdigest()
+
+
+def expose(color: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """Change a render's colours (H, W, 3) by an exposure (3, 4)."""
+    return color + color @ change[:, :3].T + change[:, 3]
+
+
+def to_float(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Convert a picture to float32 in [0, 1]; a float32 one that torch can share is not copied."""
+    if image.dtype.kind == "f":
+        return np.require(image, np.float32, ["C", "W"])
+    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
 
 
 def _top(image: npt.NDArray[Any]) -> float:
@@ -215,6 +259,7 @@ def load_views(
     *,
     max_size: int | None = None,
     damaged: Literal["warn", "error"] = "warn",
+    exposures: Mapping[str, npt.NDArray[np.floating[Any]]] = MappingProxyType({}),
 ) -> Views:
     """Read the pictures of a dataset; cameras without a picture are left out. Pictures beyond
     :data:`READ_BYTES` are read again whenever they are drawn.
@@ -225,6 +270,8 @@ def load_views(
             it.
         damaged: "error" refuses damaged pictures, for measurements; see
             :func:`attnwarp.io.read_image`.
+        exposures: (3, 4) change of colour of views by their cameras' names, see
+            :func:`attnwarp.fit.read_exposures`.
 
     Raises:
         FileFormatError: a picture is unreadable, or differs in size from its camera.
@@ -266,7 +313,8 @@ def load_views(
             "dataset: none of its cameras has an image that is there; put the images where the data"
             " set names them"
         )
-    return Views(cameras, Drawn(readers, READ_BYTES), masks)
+    changes = [exposures.get(camera.name) for camera in cameras]
+    return Views(cameras, Drawn(readers, READ_BYTES), masks, changes)
 
 
 def _read(

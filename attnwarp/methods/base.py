@@ -31,7 +31,7 @@ from attnwarp.devices import on_cpu_unless_named
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.identity import editor_digest
 from attnwarp.encoders import load_encoder
-from attnwarp.fit import compile_kernels
+from attnwarp.fit import Views, compile_kernels
 from attnwarp.fit.views import Drawn
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
@@ -46,15 +46,16 @@ from attnwarp.methods.pictures import (
     to_bytes,
 )
 from attnwarp.methods.scene import (
-    Scene,
     Segments,
     check_cameras,
     check_loaded,
+    checked_segments,
+    digests,
     near_of,
     render_picture,
 )
 from attnwarp.methods.settings import MethodSettings
-from attnwarp.methods.tuning import HELD_BYTES, Order, TrainingView, Tuning
+from attnwarp.methods.tuning import HELD_BYTES, Order, Tuning
 from attnwarp.methods.work import Work
 from attnwarp.reporting import PACE_SECONDS, SILENT, Reporter
 from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
@@ -85,6 +86,10 @@ class Options(TypedDict, total=False):
         budget: limits of the run, :class:`Budget`; None for a complete run.
         segments: masks of the edited parts: (H, W) masks of the views, bool or soft in [0, 1], or a
             function of a view's number and picture. Pixels outside keep the original.
+        masks: (H, W) bool of each view, or None: False where its picture shows what the scene
+            lacks, such as a passer-by. Tuning ignores those pixels, and no features come from them.
+        exposures: (3, 4) change of colour of each view, or None, see
+            :class:`attnwarp.fit.Views`; its picture is compared with a render so changed.
         tune_outside: True tunes all splats alike. False (default) scales each splat's steps by its
             membership in the segments, so that the rest stays.
         checkpoint_seconds: time between checkpoints of tuning (30); longer if writing one is slow.
@@ -103,6 +108,8 @@ class Options(TypedDict, total=False):
     folder: Path | str | None
     budget: Budget | None
     segments: Segments | None
+    masks: Sequence[npt.NDArray[np.bool_] | None]
+    exposures: Sequence[npt.NDArray[np.floating[Any]] | None]
     tune_outside: bool
     checkpoint_seconds: float
     backend: str
@@ -310,11 +317,12 @@ def run(
     if images is None:
         near = near_of(cameras, gaussians)
         images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
-    scene = Scene.checked(cameras, images, options.get("segments"))
+    views = Views(cameras, images, options.get("masks", ()), options.get("exposures", ()))
+    segments = checked_segments(options.get("segments"), views)
     with results_in(folder) as place:
         work = Work(
-            gaussians, scene, editor, instruction, chosen, backend,
-            workdir_of(place), options.get("report", SILENT),
+            gaussians, views, editor, instruction, chosen, backend,
+            workdir_of(place), options.get("report", SILENT), segments,
         )  # fmt: skip
         return _Run(name, make(work, chosen), work, options).go()
 
@@ -336,19 +344,19 @@ class _Run:
         self.name, self.method, self.work, self.folder = name, method, work, work.folder
         self.budget = options.get("budget") or Budget()
         self.clock = CheckpointClock(options.get("checkpoint_seconds", 30.0))
-        self.names = file_stems(work.scene.cameras)
+        self.names = file_stems(work.views.cameras)
         self.seconds = self.folder.seconds
         plan = Plan(method)
         self.rounds, self.planned = tuple(plan.rounds), iter(plan.calls)
-        bound = work.scene.segments is not None and work.settings.composite == "original"
+        bound = work.segments is not None and work.settings.composite == "original"
         self.bound = bound and not options.get("tune_outside", False)
         self.tuning = Tuning(
-            work.frozen, work.scene.cameras, work.settings,
+            work.frozen, work.views.cameras, work.settings,
             sum(part.iterations for part in self.rounds), work.backend,
             work.membership() if self.bound else None, options.get("load", load_encoder),
         )  # fmt: skip
         tuned = sorted({view for part in self.rounds for view in part.training})
-        self.tuning.check_sizes([work.scene.cameras[view] for view in tuned])
+        self.tuning.check_sizes([work.views.cameras[view] for view in tuned])
         self.rows, self.edits = 0, 0
         self.latest: dict[int, int] = {}  # round of each view's last edit
         self.places = [0] * len(self.rounds)  # groups edited so far in each round
@@ -378,7 +386,7 @@ class _Run:
                 ],
                 "inputs": {
                     "splats": work.frozen.digest(),
-                    **work.scene.digest(),
+                    **digests(work.views, work.segments),
                     "editor": editor_digest(work.editor),
                     **self.tuning.weights,
                     **method.inputs,
@@ -530,7 +538,7 @@ class _Run:
         if self.work.backend in ("auto", "cpu"):
             # Excluded from the budget's seconds.
             compile_kernels(self.work.frozen.kind, device=self.tuning.model.device)
-        views = Drawn([partial(self._training, view) for view in training], HELD_BYTES)
+        views = self._training(training)
         text = f"round {number + 1} of {len(self.rounds)}: tuning"
 
         def step() -> None:
@@ -541,19 +549,29 @@ class _Run:
                     self.seconds.write()
 
         with self.seconds.part("tune"):
-            self.tuning.advance(begin, end, views, order, spent=self._out_of_seconds, step=step)
+            self.tuning.advance(
+                begin, end, views, training, order, spent=self._out_of_seconds, step=step
+            )
             self.folder.save(state, self.tuning.state())
         if self.tuning.iteration < end:
             self._cut("seconds", number, self.places[number])
 
-    def _training(self, view: int) -> TrainingView:
-        camera = self.work.scene.cameras[view]
+    def _training(self, numbers: Sequence[int]) -> Views:
+        """Collect views with their edits at full size, to tune on."""
+        of = self.work.views
+        return Views(
+            [of.cameras[k] for k in numbers],
+            Drawn([partial(self._target, k) for k in numbers], HELD_BYTES),
+            [of.masks[k] for k in numbers],
+            [of.exposures[k] for k in numbers],
+        )
+
+    def _target(self, view: int) -> Image:
         edited = self._edited(view).astype(np.float32) / np.float32(255)
-        s, segments = self.work.settings, self.work.scene.segments
+        s, segments = self.work.settings, self.work.segments
         segment = None if segments is None else segments[view]
-        original = self.work.scene.picture(view)
-        picture = full_size(original, edited, segment, s.composite, s.composite_blur)
-        return TrainingView(view, camera, picture)
+        original = self.work.views.picture(view)
+        return full_size(original, edited, segment, s.composite, s.composite_blur)
 
     # --- results
 
@@ -565,7 +583,7 @@ class _Run:
             for view, pixels in edited.items():
                 self.folder.write_picture(f"views/{self.names[view]}.png", pixels)
             for part, model in (("before", self.work.frozen), ("after", final)):
-                for camera, name in zip(self.work.scene.cameras, self.names, strict=True):
+                for camera, name in zip(self.work.views.cameras, self.names, strict=True):
                     path = f"renders/{part}/{name}.png"
                     if not self.folder.has(path):
                         picture = render_picture(model, camera, self.work.near, self.work.backend)
@@ -617,9 +635,9 @@ class _Run:
         views = [view for view in self.latest if view not in self.method.psnr_leaves_out]
         errors = []
         for view in views:
-            target = self._training(view)
-            picture = render_picture(final, target.camera, self.work.near, self.work.backend)
-            errors.append(float(np.square(picture.astype(np.float64) - target.picture).mean()))
+            picture, kept = self.work.render(view, final, full=True), self.work.views.masks[view]
+            squared = np.square(picture.astype(np.float64) - self._target(view))
+            errors.append(float((squared if kept is None else squared[kept]).mean()))
         finite = [v for v in map(losses.psnr_of_mse, errors) if np.isfinite(v)]
         pooled = losses.psnr_of_mse(sum(errors) / len(errors)) if errors else np.inf
         return {
@@ -629,7 +647,7 @@ class _Run:
         }
 
     def _write_segments(self) -> None:
-        for name, segment in zip(self.names, self.work.scene.segments or (), strict=False):
+        for name, segment in zip(self.names, self.work.segments or (), strict=False):
             path = f"segments/{name}.png"
             if not self.folder.has(path):
                 share = np.repeat(segment[..., None].astype(np.float32), 3, axis=2)
@@ -643,7 +661,7 @@ class _Run:
             if count > SHEET_VIEWS
             else [*range(count)]
         )
-        h, w = self.work.scene.images[views[0]].shape[:2]
+        h, w = self.work.views.images[views[0]].shape[:2]
 
         def tile(name: str) -> Bytes:
             if not self.folder.has(name):

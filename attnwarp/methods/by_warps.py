@@ -34,7 +34,7 @@ class ByWarps(Method):
         sources: Sequence[int] | None = None,
         targets: Sequence[int] | None = None,
     ) -> None:
-        self.work, self.names = work, file_stems(work.scene.cameras)
+        self.work, self.names = work, file_stems(work.views.cameras)
         self.geometry = Geometry(work, AttentionWarpingSettings(warp=settings.warp), warps)
         if warps is not None:
             views = range(len(self.names))

@@ -36,12 +36,14 @@ def change_of(
     Args:
         source: name of the source view, excluded from the scene's change; None for no source.
     """
-    segments = work.scene.segments
+    segments = work.segments
 
-    def mask(view: int, size: Size) -> Mask | None:
-        if segments is None:
+    def mask(view: int, size: Size, kept: Mask | None = None) -> Mask | None:
+        parts = [] if segments is None else [segments[view] > 0.5]
+        parts += [] if kept is None else [kept]
+        if not parts:
             return None
-        inside = np.asarray(segments[view] > 0.5, dtype=np.float32)
+        inside = np.logical_and.reduce(parts).astype(np.float32)
         return np.asarray(resized(inside[..., None].repeat(3, 2), size)[..., 0] > 0.5)
 
     def rendered(views: Iterable[int]) -> float | None:
@@ -54,8 +56,8 @@ def change_of(
 
     def edit(view: int) -> tuple[Bytes, Bytes, Mask | None]:
         size = edited[view].shape[:2]  # a method may return another size than requested
-        before = resized(work.scene.picture(view), size)
-        return to_bytes(before), edited[view], mask(view, size)
+        before = resized(work.views.picture(view), size)
+        return to_bytes(before), edited[view], mask(view, size, work.views.masks[view])
 
     views = range(len(names))
     scene = rendered(view for view in views if names[view] != source)
@@ -75,12 +77,12 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
     Returns:
         Attributes of a :class:`attnwarp.drift.Drift`; None if it can't be told.
     """
-    size, segments = picture.shape[:2], work.scene.segments
+    size, segments = picture.shape[:2], work.segments
     left = None
     if segments is not None:
         touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
         left = resized(touched, size)[..., 0] == 0
-    found = drift(to_bytes(resized(work.scene.picture(view), size)), to_bytes(picture), left)
+    found = drift(to_bytes(resized(work.views.picture(view), size)), to_bytes(picture), left)
     return None if found is None else asdict(found)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,6 @@ from attnwarp.methods.marks import (
 from attnwarp.methods.page import show_edit
 from attnwarp.methods.page.orbit import check_film
 from attnwarp.methods.pictures import Segment, check_view_aspect
-from attnwarp.methods.scene import images_of
 from attnwarp.methods.settings import AttentionWarpingSettings, SourceSettings
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
@@ -110,6 +110,7 @@ def edit_dataset(
     source_picture: Path | None = None,
     notes: Sequence[str] = (),
     origin: str = "",
+    exposures: Mapping[str, npt.NDArray[np.float64]] = MappingProxyType({}),
     report: Reporter,
     **own: Any,
 ) -> tuple[Result, Path]:
@@ -121,6 +122,8 @@ def edit_dataset(
         editor_name: name or path, see :func:`attnwarp.editing.small.load_editor`.
         source_picture: file of the source view edited elsewhere, for attention warping.
         origin: sentence on the origin of the inputs, for the page.
+        exposures: (3, 4) change of colour of views, by their names; see
+            :func:`attnwarp.fit.read_exposures`.
         own: additional options of the method, such as "budget".
 
     Returns:
@@ -137,17 +140,17 @@ def edit_dataset(
     editor.check_text(instruction)
     if settings.size is None:
         settings = settings.changed(size=editor.own_size)
-    views = load_views(dataset, max_size=options.max_size)
-    images = images_of(views)
+    views = load_views(dataset, max_size=options.max_size, exposures=exposures)
+    if exposures:
+        known = sum(change is not None for change in views.exposures)
+        report.log(f"{known} of {len(views)} views have the exposure that the fit estimated")
     warping = isinstance(settings, AttentionWarpingSettings)
     if warping:
         by_hand = _by_hand(source_picture, dataset, views, index)
         own = {"source": index, "source_picture": by_hand, **own}
     elif isinstance(settings, SourceSettings):
         own = {"source": index, **own}
-    segments = marked(
-        options.marks, editor_name, dataset, views, images, index, out, device, report
-    )
+    segments = marked(options.marks, editor_name, dataset, views, index, out, device, report)
     if splats is None:
         assert fit_plan is not None
         # Refuse settings that the editor or the tuning cannot use before the fit.
@@ -162,11 +165,13 @@ def edit_dataset(
     result = METHODS[method](
         splats,
         views.cameras,
-        images,
+        views.images,
         editor,
         instruction,
         settings,
         segments=segments(splats),
+        masks=views.masks,
+        exposures=views.exposures,
         tune_outside=options.tune_outside,
         folder=out,
         report=report,
@@ -180,7 +185,7 @@ def edit_dataset(
     # A bundled editor takes seconds, so it also edits the views alone.
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
-        workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
+        workdir_of(out), splats, views, turntable=options.turntable, report=report,
         editor=editor if control else None, notes=notes, origin=origin,
     )  # fmt: skip
     return result, page
@@ -229,7 +234,6 @@ def marked(
     editor_name: str,
     dataset: Dataset,
     views: Views,
-    images: Sequence[npt.NDArray[Any]],
     index: int,
     out: Path,
     device: str,
@@ -249,16 +253,24 @@ def marked(
     check_marks(*size, box=marks.box, at=marks.at)
 
     def of_source(piece: Mask | None = None) -> Mask:
-        return source_mask(
-            marks, camera, images[index], pictures[index], size, out, device, report, piece
+        mask = source_mask(
+            marks, camera, views.picture(index), pictures[index], size, out, device, report, piece
         )
+        kept = views.masks[index]
+        if kept is not None and not (mask & kept).any():
+            raise InputError(
+                f"{marks.option}: marks only what the capture's mask of {camera.name} ignores, and"
+                " the scene lacks; mark another part, or leave the masks out by --ignore-key"
+                " mask_path"
+            )
+        return mask
 
     early = None if marks.at is not None else of_source()
 
     def segments(splats: Gaussians) -> list[Segment]:
         at = [camera.width / size[0] * v for v in marks.at or ()]
         mask = of_source(piece_around(splats, camera, at)) if early is None else early
-        lifted = lifted_segments(mask, splats, views.cameras, index, report)
+        lifted = lifted_segments(mask, splats, views, index, report)
         if not any((segment > 0.5).any() for segment in lifted):
             raise InputError(
                 f"{marks.option}: lifted through the splats, what it marks covers no pixel of any"

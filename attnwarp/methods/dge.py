@@ -84,7 +84,7 @@ class DGE(Method):
         work, s = self.work, self.settings
         for number, iterations in enumerate(parts_of(s.iterations, s.every)):
             order = torch.randperm(len(work.sizes), generator=work.generator(VIEWS, number))
-            views = by_angle(work.scene.cameras, sorted(order[: s.views].tolist()))
+            views = by_angle(work.views.cameras, sorted(order[: s.views].tolist()))
             keys = sum(self._with_keys(number)) * len(chunks(views, s.batch))
             rows = (s.steps * len(views) + keys) * work.branches()
             loop.edit(number, views, partial(self.edit, number, views), rows=rows)
@@ -98,7 +98,7 @@ class DGE(Method):
         editor: Any = work.editor
         timesteps = editor.schedule.published(self._start(number), s.steps, s.grid)
         (noised,) = editor.schedule.published(self._start(number), 1)
-        cameras = [work.scene.cameras[view] for view in group]
+        cameras = [work.views.cameras[view] for view in group]
         batches = chunks(range(len(group)), s.batch)
         generator = work.generator(KEYS, number)
         drawn: list[list[str]] = []

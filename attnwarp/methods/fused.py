@@ -126,7 +126,7 @@ class Fused(ByWarps):
 
     def nearest(self, view: int) -> list[int]:
         """List the nearest other views, by the distance of centres plus the angle in radians."""
-        cameras = self.work.scene.cameras
+        cameras = self.work.views.cameras
         own = cameras[view]
 
         def apart(k: int) -> float:

@@ -123,7 +123,7 @@ class GaussCtrl(Method):
                 latents=latents,
                 on_step=lambda *_: step(),
             )
-        about = {"references": [work.scene.cameras[view].name for view in self.references]}
+        about = {"references": [work.views.cameras[view].name for view in self.references]}
         return [ViewEdit(picture, about) for picture in result.images[count:]]
 
     def latents(self, view: int, depth: Guide) -> Tensor:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy.typing as npt
+import torch
 
 from attnwarp import check
 from attnwarp.digest import digest_each
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.work import Work
-from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, warp_view
+from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, sample_at, warp_view
 
 Warps = Callable[[int, int], WarpedView]
 """Function that returns the warp from a source view to a target view, by their numbers."""
@@ -27,22 +28,22 @@ class Geometry:
 
     def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
         """Compute the warp from one view to another by depth of the original or current model."""
-        s, scene = self.settings, self.work.scene
+        s, views, segments = self.settings, self.work.views, self.work.segments
         if self.outside is not None:
-            return self._masked(self.outside(source, target))
+            return self._masked(source, self.outside(source, target))
         before = self.work.frozen if s.depth_from == "frozen" else model
         reads: dict[str, Any] = {}
         wanted = parts_read(s.warp)
         if "source_image" in wanted:
-            reads["source_image"] = scene.picture(source)
+            reads["source_image"] = views.picture(source)
         if "target_image" in wanted:
-            reads["target_image"] = scene.picture(target)
-        if "target_segment" in wanted and scene.segments is not None:
-            reads["target_segment"] = scene.segments[target] > 0.5
+            reads["target_image"] = views.picture(target)
+        if "target_segment" in wanted and segments is not None:
+            reads["target_segment"] = segments[target] > 0.5
         warp = warp_view(
             before,
-            scene.cameras[source],
-            scene.cameras[target],
+            views.cameras[source],
+            views.cameras[target],
             s.warp,
             **reads,
             source_surface=self._surface(source, before),
@@ -50,16 +51,23 @@ class Geometry:
             backend=self.work.backend,
             warn_empty=False,
         )
-        return self._masked(warp)
+        return self._masked(source, warp)
 
-    def _masked(self, warp: WarpedView) -> WarpedView:
-        return warp if self.settings.mask else warp.with_mask(warp.rules["defined"])
+    def _masked(self, source: int, warp: WarpedView) -> WarpedView:
+        if not self.settings.mask:
+            warp = warp.with_mask(warp.rules["defined"])
+        kept = self.work.views.masks[source]
+        if kept is None:
+            return warp
+        # What the source's mask ignores, such as a passer-by, is not on the surface behind it.
+        share = sample_at(torch.from_numpy(kept)[None].double(), warp.correspondence.xy)[0]
+        return warp.with_mask(warp.mask & (share > 0.5))
 
     def _surface(self, view: int, model: Gaussians) -> Surface:
         if model is self.work.frozen and view in self._frozen:
             return self._frozen[view]
         surface = render_surface(
-            model, self.work.scene.cameras[view], self.settings.warp,
+            model, self.work.views.cameras[view], self.settings.warp,
             near=self.work.near, backend=self.work.backend,
         )  # fmt: skip
         if model is self.work.frozen:
@@ -68,7 +76,7 @@ class Geometry:
 
     def digest(self, sources: Sequence[int], targets: Sequence[int]) -> str:
         """Hash the external warps between views (SHA-256): a function has no other identity."""
-        outside, cameras = self.outside, self.work.scene.cameras
+        outside, cameras = self.outside, self.work.views.cameras
         assert outside is not None
 
         def parts() -> Iterator[npt.NDArray[Any]]:

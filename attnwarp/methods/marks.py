@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,11 @@ from attnwarp.camera import Camera
 from attnwarp.digest import digest
 from attnwarp.editing.segment import CORE, Mask, cut_out, load_segmenter, segments_of, snap
 from attnwarp.errors import InputError, InputWarning
+from attnwarp.fit import Views
+from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
 from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
-from attnwarp.methods.scene import to_float
 from attnwarp.reporting import Reporter
 from attnwarp.warp import lift_masks
 from attnwarp.workdir import Workdir
@@ -189,7 +189,7 @@ def mask_by_words(
 def lifted_segments(
     mask: Mask,
     splats: Gaussians,
-    cameras: Sequence[Camera],
+    views: Views,
     source: int,
     report: Reporter,
 ) -> list[Segment]:
@@ -197,7 +197,8 @@ def lifted_segments(
 
     Values are multiples of 1/255, as in mask pictures.
     """
-    lifted = lift_masks(splats, [cameras[source]], [mask])
+    kept = [views.masks[source]]
+    lifted = lift_masks(splats, [views.cameras[source]], [mask], kept=kept)
     (agreement,) = lifted.agreement
     left_out = int((~lifted.reached).sum())
     alone = f", {left_out} of them left out, as they have none" if left_out else ""
@@ -213,7 +214,7 @@ def lifted_segments(
             stacklevel=2,
         )
     # The soft edge lies inside, so that pixels marked less than half do not change.
-    soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in cameras)
+    soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in views.cameras)
     return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
 
 

@@ -1,9 +1,8 @@
-"""Inputs of an edit: cameras, pictures before the edit, and segments."""
+"""Inputs of an edit: their checks and hashes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,6 +14,7 @@ from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
 from attnwarp.fit import FitSettings, Views, extent_of
+from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.pictures import Image, Segment
 from attnwarp.render import render
@@ -24,70 +24,47 @@ Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.ND
 view's number and its picture."""
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Views before the edit.
+def checked_segments(segments: Segments | None, views: Views) -> list[Segment] | None:
+    """Validate the masks of the edited part: (H, W) bool, or float32 in [0, 1]; None edits
+    everything."""
+    if segments is None:
+        return None
+    given = (
+        [segments(k, views.picture(k)) for k in range(len(views))]
+        if callable(segments)
+        else segments
+    )
+    if len(given) != len(views):
+        raise ValueError(f"segments: got {len(given)}, expected {len(views)}, as cameras")
+    masks = []
+    for k, (segment, camera) in enumerate(zip(given, views.cameras, strict=True)):
+        name = f"segments[{k}] ({camera.name})"
+        mask = np.asarray(segment)
+        check.shape(mask, (camera.height, camera.width), name)
+        if mask.dtype != np.bool_:
+            if mask.dtype.kind != "f":
+                raise ValueError(f"{name}: got {mask.dtype}, expected bool, or floating")
+            mask = checked_image(mask, name)
+        masks.append(mask)
+    if not any((mask > 0.5).any() for mask in masks):
+        raise ValueError("segments: every one is empty, so nothing may change; True is edited")
+    return masks
 
-    Attributes:
-        images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
-            memory; :meth:`picture` converts one.
-        segments: (H, W) bool, or float32 in [0, 1] with soft edges; None if everything is edited.
-    """
 
-    cameras: list[Camera]
-    images: list[npt.NDArray[Any]]
-    segments: list[Segment] | None
-
-    @classmethod
-    def checked(
-        cls,
-        cameras: Sequence[Camera],
-        images: Sequence[npt.NDArray[Any]],
-        segments: Segments | None,
-    ) -> Scene:
-        """Validate external inputs."""
-        if len(images) != len(cameras):
-            raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
-        stored = []
-        for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-            name = f"images[{k}] ({camera.name})"
-            check.shape(np.asarray(image), (camera.height, camera.width, 3), name)
-            stored.append(checked_image(image, name))
-        if segments is None:
-            return cls(list(cameras), stored, None)
-        given = (
-            [segments(k, to_float(image)) for k, image in enumerate(stored)]
-            if callable(segments)
-            else segments
-        )
-        if len(given) != len(cameras):
-            raise ValueError(f"segments: got {len(given)}, expected {len(cameras)}, as cameras")
-        masks = []
-        for k, (segment, camera) in enumerate(zip(given, cameras, strict=True)):
-            name = f"segments[{k}] ({camera.name})"
-            mask = np.asarray(segment)
-            check.shape(mask, (camera.height, camera.width), name)
-            if mask.dtype != np.bool_:
-                if mask.dtype.kind != "f":
-                    raise ValueError(f"{name}: got {mask.dtype}, expected bool, or floating")
-                mask = checked_image(mask, name)
-            masks.append(mask)
-        if not any((mask > 0.5).any() for mask in masks):
-            raise ValueError("segments: every one is empty, so nothing may change; True is edited")
-        return cls(list(cameras), stored, masks)
-
-    def picture(self, view: int) -> Image:
-        """Convert a view's picture to (H, W, 3) float32 in [0, 1]."""
-        return to_float(self.images[view])
-
-    def digest(self) -> dict[str, str | None]:
-        """Hash cameras, pictures and segments (SHA-256)."""
-        cameras = [{**camera.to_dict(), "name": camera.name} for camera in self.cameras]
-        return {
-            "cameras": digest(cameras),
-            "images": digest_each(map(to_float, self.images)),
-            "segments": None if self.segments is None else digest(*self.segments),
-        }
+def digests(views: Views, segments: Sequence[Segment] | None) -> dict[str, str | None]:
+    """Hash cameras, pictures and segments (SHA-256), and masks and exposures if there are any."""
+    cameras = [{**camera.to_dict(), "name": camera.name} for camera in views.cameras]
+    parts: dict[str, Sequence[Any]] = {"masks": views.masks, "exposures": views.exposures}
+    return {
+        "cameras": digest(cameras),
+        "images": digest_each(map(views.picture, range(len(views)))),
+        "segments": None if segments is None else digest(*segments),
+        **{
+            name: digest(*(v if v is None else np.asarray(v) for v in values))
+            for name, values in parts.items()
+            if any(value is not None for value in values)
+        },
+    }
 
 
 def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
@@ -100,23 +77,7 @@ def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     check.finite(array, name)
     if array.min() < 0 or array.max() > 1:
         raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
-    # A float32 picture is copied only if torch cannot share its memory.
-    return np.require(array, np.float32, ["C", "W"])
-
-
-def to_float(image: npt.NDArray[Any]) -> Image:
-    """Convert a checked image to (H, W, 3) float32 in [0, 1]."""
-    if image.dtype.kind == "f":
-        return image
-    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
-
-
-def images_of(views: Views) -> list[npt.NDArray[Any]]:
-    """List each view's stored picture (H, W, 3); transparent pictures over black, as float32."""
-    return [
-        image if image.shape[2] == 3 else views.target(k, np.zeros(3)).numpy()
-        for k, image in enumerate(views.images)
-    ]
+    return to_float(array)
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
@@ -145,10 +106,20 @@ def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
     return FitSettings().near * extent_of(cameras, gaussians.world_means())
 
 
-def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
-    """Render a view over black, (H, W, 3) float32 in [0, 1]."""
+def render_picture(
+    gaussians: Gaussians,
+    camera: Camera,
+    near: float,
+    backend: str,
+    exposed: Callable[[torch.Tensor], torch.Tensor] = lambda color: color,
+) -> Image:
+    """Render a view over black, (H, W, 3) float32 in [0, 1].
+
+    Args:
+        exposed: change of the colours, such as a picture's exposure.
+    """
     with torch.no_grad():
-        color = render(gaussians, camera, backend=backend, near=near).color
+        color = exposed(render(gaussians, camera, backend=backend, near=near).color)
     if bool(color.isnan().any()):
         raise RuntimeError(f"view {camera.name!r} renders as NaN; lower the learning rates")
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())

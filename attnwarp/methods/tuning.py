@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
@@ -17,11 +15,10 @@ from torch import Tensor
 from attnwarp import losses
 from attnwarp.camera import Camera
 from attnwarp.encoders import EncoderInfo, load_encoder
-from attnwarp.fit import FitSettings, extent_of
+from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.fit.model import Model
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError
-from attnwarp.methods.pictures import Image
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.render import Render, render
 from attnwarp.workdir import Workdir
@@ -63,28 +60,6 @@ def perceptual_net(
     return cast(PerceptualLoss, load(settings.perceptual_encoder, "perceptual", device=device))
 
 
-@dataclass(frozen=True, eq=False)
-class TrainingView:
-    """View to tune on."""
-
-    number: int
-    camera: Camera
-    picture: Image
-
-    def on(self, device: torch.device) -> Tensor:
-        """Copy the picture (H, W, 3) to a device and cache it there while the view lives."""
-        return self._tensors.setdefault(device, torch.from_numpy(self.picture).to(device))
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the picture."""
-        return self.picture.nbytes
-
-    @cached_property
-    def _tensors(self) -> dict[torch.device, Tensor]:
-        return {}
-
-
 HELD_BYTES = 2**31
 """Bytes of views to tune on that are kept: 164 of 1297 x 840 px."""
 
@@ -108,25 +83,32 @@ class DistanceToViews:
         self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES, scaled: bool = True
     ) -> None:
         self._perceptual, self._bytes, self._scaled = perceptual, kept_bytes, scaled
-        self._kept: WeakKeyDictionary[TrainingView, list[Tensor]] = WeakKeyDictionary()
+        self._kept: WeakKeyDictionary[Views, dict[int, list[Tensor]]] = WeakKeyDictionary()
 
-    def __call__(self, image: Tensor, view: TrainingView) -> Tensor:
+    def __call__(self, image: Tensor, views: Views, index: int) -> Tensor:
         """Compute the distance () of a render (H, W, 3), differentiable, to a view's picture."""
-        target = self._of(view, image.device)
+        target = self._of(views, index, image.device)
         return self._perceptual.between(self._features(image), target)
 
     def _features(self, image: Tensor) -> list[Tensor]:
         return self._perceptual.features(image if self._scaled else (image + 1) / 2)
 
-    def _of(self, view: TrainingView, device: torch.device) -> list[Tensor]:
-        if view in self._kept:
-            return self._kept[view]
+    def _of(self, views: Views, index: int, device: torch.device) -> list[Tensor]:
+        kept = self._kept.setdefault(views, {})
+        if index in kept:
+            return kept[index]
         with torch.no_grad():
-            features = self._features(view.on(device))
-        held = sum(x.nbytes for kept in self._kept.values() for x in kept)
+            features = self._features(target_of(views, index, device))
+        held = sum(x.nbytes for each in self._kept.values() for one in each.values() for x in one)
         if held + sum(x.nbytes for x in features) <= self._bytes:
-            self._kept[view] = features
+            kept[index] = features
         return features
+
+
+def target_of(views: Views, index: int, device: torch.device) -> Tensor:
+    """Return the picture (H, W, 3) that a view is tuned on, black where its mask ignores it."""
+    black = torch.zeros(3, dtype=torch.float32, device=device)
+    return views.masked(index, views.target(index, black))
 
 
 class Tuning:
@@ -199,7 +181,8 @@ class Tuning:
         self,
         begin: int,
         end: int,
-        views: Sequence[TrainingView],
+        views: Views,
+        numbers: Sequence[int],
         order: Order | None = None,
         *,
         spent: Callable[[], bool] = lambda: False,
@@ -208,23 +191,25 @@ class Tuning:
         """Tune from the current iteration to the end of a round, or until the budget is spent.
 
         Args:
+            views: views to tune on.
+            numbers: their numbers among all views, for :attr:`visits`.
             order: order of the views; None takes each once before any comes again, at random.
             spent: function that returns True once no further iteration may begin.
         """
         if self.iteration == begin:
             self.queue = []  # the previous round had different views
         while self.iteration < end and not spent():
-            self._iterate(self._next(views, self.iteration - begin, order))
+            index = self._next(len(views), self.iteration - begin, order)
+            self._iterate(views, index)
+            self.visits[numbers[index]] = self.visits.get(numbers[index], 0) + 1
             step()
 
-    def _next(
-        self, views: Sequence[TrainingView], number: int, order: Order | None
-    ) -> TrainingView:
+    def _next(self, count: int, number: int, order: Order | None) -> int:
         if order is not None:
-            return views[order(number)]
+            return order(number)
         if not self.queue:
-            self.queue = torch.randperm(len(views), generator=self.random).tolist()
-        return views[self.queue.pop()]
+            self.queue = torch.randperm(count, generator=self.random).tolist()
+        return self.queue.pop()
 
     def state(self) -> dict[str, Any]:
         """Collect the state that the next iteration depends on."""
@@ -250,7 +235,8 @@ class Tuning:
             path = folder.path / name
             raise FileFormatError(path, f"lacks something ({error}); remove it") from error
 
-    def _iterate(self, view: TrainingView) -> None:
+    def _iterate(self, views: Views, index: int) -> None:
+        camera = views.cameras[index]
         background = self.model.background(self.settings.background, self.random)
         try:
             gaussians = self.model.gaussians()
@@ -258,23 +244,22 @@ class Tuning:
             raise RuntimeError(f"tuning, iteration {self.iteration}: {error}") from error
         picture = render(
             gaussians,
-            view.camera,
+            camera,
             backend=self.backend,
             background=background,
             near=self.fit.near * self.model.extent,
         )
-        loss = self.loss_of(picture, view)
+        loss = self.loss_of(picture, views, index)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise RuntimeError(
                 f"tuning, iteration {self.iteration}: the loss is {value} on view"
-                f" {view.camera.name!r}; lower color_rate"
+                f" {camera.name!r}; lower color_rate"
             )
         loss.backward()
         self.iteration += 1
         self._step(self.iteration / max(1, self.iterations))
         self.loss = value
-        self.visits[view.number] = self.visits.get(view.number, 0) + 1
 
     def _step(self, progress: float) -> None:
         """Take one step of the model, scaled for each splat by its membership."""
@@ -289,14 +274,14 @@ class Tuning:
                 share = self.membership.reshape(-1, *[1] * (tensor.dim() - 1))
                 tensor.copy_(torch.lerp(before[name], tensor, share))
 
-    def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
+    def loss_of(self, picture: Render, views: Views, index: int) -> Tensor:
         """Compute the weighted sum of the losses."""
         s = self.settings
-        image = picture.color.float()
-        target = view.on(image.device)
+        image = views.masked(index, views.exposed(index, picture.color.float()))
+        target = target_of(views, index, image.device)
         loss = s.l1 * losses.l1(image, target)
         if self.perceptual is not None:
-            loss = loss + s.perceptual * self.perceptual(image.clamp(0, 1), view).to(loss)
+            loss = loss + s.perceptual * self.perceptual(image.clamp(0, 1), views, index).to(loss)
         if s.ssim:
             loss = loss + s.ssim * (1 - losses.ssim(image, target))
         if s.normal:

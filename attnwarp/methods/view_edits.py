@@ -21,6 +21,7 @@ from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, n
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import Recording, RecordingPlan
 from attnwarp.editing.schedule import Size, Time
+from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.base import ViewEdit, edit_file
@@ -36,7 +37,7 @@ from attnwarp.methods.pictures import (
     resized,
     to_bytes,
 )
-from attnwarp.methods.scene import checked_image, to_float
+from attnwarp.methods.scene import checked_image
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.unseen import (
     SourceTokens,
@@ -125,7 +126,7 @@ class ViewEdits:
         edit_source: Callable[..., list[ViewEdit]],
     ) -> None:
         self.work, self.settings, self.edit_source = work, settings, edit_source
-        self.names = file_stems(work.scene.cameras)
+        self.names = file_stems(work.views.cameras)
         check.instance(source, Integral, "source", "a number of a view")
         if not 0 <= source < len(self.names):
             raise ValueError(
@@ -149,7 +150,7 @@ class ViewEdits:
 
     @property
     def _wants_attention(self) -> bool:
-        marked = self.work.scene.segments is not None
+        marked = self.work.segments is not None
         return self.settings.unseen == "attend" and marked and bool(self.features.layers)
 
     @property
@@ -173,7 +174,7 @@ class ViewEdits:
     ) -> None:
         """Let unseen tokens of views attend to the source, until the stack is left."""
         tokens = self.recorded.tokens
-        segments = self.work.scene.segments
+        segments = self.work.segments
         if tokens is None or segments is None:
             return
         unseen = [
@@ -190,7 +191,7 @@ class ViewEdits:
         check.shape(np.asarray(picture), ("H", "W", 3), "source_picture")
         image = to_float(checked_image(picture, "source_picture"))
         size = (image.shape[0], image.shape[1])
-        check_view_aspect(size, self.work.scene.cameras[source], "source_picture")
+        check_view_aspect(size, self.work.views.cameras[source], "source_picture")
         if self.settings.latents == "inversion":
             raise ValueError(
                 "source_picture: got one with latents 'inversion', but its own noise is replayed;"
@@ -367,7 +368,7 @@ class ViewEdits:
         """Collect a view's edit with its record and pictures."""
         about: dict[str, Any] = {"injected": 0.0}
         pictures, recording = {}, self.recorded.recording
-        shape = self.work.scene.images[view].shape[:2]
+        shape = self.work.views.images[view].shape[:2]
         if view == self.source:
             about["feature_bytes"] = 0 if recording is None else recording.plan.bytes
             if recording is not None:

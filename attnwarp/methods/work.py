@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from torch import Tensor
 
 from attnwarp.editing.editor import Edit, Editor, edit, guided, shared_noise
 from attnwarp.editing.schedule import Grid
+from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import FRESH, own_seed
 from attnwarp.methods.pictures import Image, Segment, Size, composite, edit_size, resized
-from attnwarp.methods.scene import Scene, near_of, render_picture
+from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.reporting import Reporter
 from attnwarp.warp import WarpSettings, lift_masks, render_surface
@@ -34,6 +36,8 @@ class Work:
 
     Attributes:
         frozen: the splats before the edit, outside autograd.
+        views: the views before the edit.
+        segments: (H, W) bool, or float32 in [0, 1] with soft edges; None if everything is edited.
         sizes: (h, w) px of each view's edit.
         near: near-plane depth, in scene units.
     """
@@ -41,38 +45,42 @@ class Work:
     def __init__(
         self,
         gaussians: Gaussians,
-        scene: Scene,
+        views: Views,
         editor: Editor,
         instruction: str,
         settings: MethodSettings,
         backend: str,
         folder: Workdir,
         report: Reporter,
+        segments: list[Segment] | None = None,
     ) -> None:
-        self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
+        self.frozen, self.editor = gaussians.detach(), editor
+        self.views, self.segments = views, segments
         self.folder, self.report = folder, report
         self.instruction, self.settings, self.backend = instruction, settings, backend
         multiple = editor.side_multiple
         self.sizes: list[Size] = [
             edit_size(camera.height, camera.width, settings.size, multiple)
-            for camera in scene.cameras
+            for camera in views.cameras
         ]
-        self.near = near_of(scene.cameras, gaussians)
+        self.near = near_of(views.cameras, gaussians)
 
     def picture(self, view: int) -> Image:
         """Return a view's picture before the edit, (h, w, 3), at the size of its edit."""
-        return resized(self.scene.picture(view), self.sizes[view])
+        return resized(self.views.picture(view), self.sizes[view])
 
-    def render(self, view: int, model: Gaussians) -> Image:
-        """Render a view of the splats at the size of its edit, (h, w, 3)."""
-        h, w = self.sizes[view]
-        camera = self.scene.cameras[view].resize(w, h)
-        return render_picture(model, camera, self.near, self.backend)
+    def render(self, view: int, model: Gaussians, *, full: bool = False) -> Image:
+        """Render a view of the splats, exposed as its picture, at the size of its edit, (h, w, 3),
+        or at the picture's."""
+        camera, (h, w) = self.views.cameras[view], self.sizes[view]
+        shown = camera if full else camera.resize(w, h)
+        exposed = partial(self.views.exposed, view)
+        return render_picture(model, shown, self.near, self.backend, exposed)
 
     def depth(self, view: int, model: Gaussians, warp: WarpSettings | None = None) -> Guide:
         """Render the depth of splats, (h, w); NaN where undefined."""
         h, w = self.sizes[view]
-        camera = self.scene.cameras[view].resize(w, h)
+        camera = self.views.cameras[view].resize(w, h)
         settings = warp or WarpSettings()
         surface = render_surface(model, camera, settings, near=self.near, backend=self.backend)
         return np.asarray(surface.depth)
@@ -116,9 +124,9 @@ class Work:
 
     def composite(self, view: int, picture: Image) -> Image:
         """Compose the edit inside the view's segment with the settings' choice outside."""
-        if self.scene.segments is None:
+        if self.segments is None:
             return picture
-        s, segment = self.settings, self.scene.segments[view]
+        s, segment = self.settings, self.segments[view]
         return composite(picture, self.picture(view), segment, s.composite, s.composite_blur)
 
     def membership(self) -> npt.NDArray[np.float64]:
@@ -126,16 +134,21 @@ class Work:
 
         It is 0 if at most half of the splat's pixels are marked, and 1 from three quarters on.
         """
-        segments = self.scene.segments
+        segments = self.segments
         assert segments is not None
         lifted = lift_masks(
-            self.frozen, self.scene.cameras, segments, near=self.near, backend=self.backend
+            self.frozen,
+            self.views.cameras,
+            segments,
+            kept=self.views.masks,
+            near=self.near,
+            backend=self.backend,
         )
         return np.asarray(np.clip(4 * lifted.membership - 2, 0, 1))
 
     def regions(self, views: Sequence[int]) -> list[Segment] | None:
         """List views' masks for a bundled editor's noise; None if everything is edited."""
-        segments = self.scene.segments
+        segments = self.segments
         return None if segments is None else [segments[view] for view in views]
 
     def one_size(self, method: str) -> None:

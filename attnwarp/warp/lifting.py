@@ -88,6 +88,7 @@ def lift_masks(
     cameras: Sequence[Camera],
     masks: Sequence[npt.NDArray[Any]],
     *,
+    kept: Sequence[npt.NDArray[np.bool_] | None] | None = None,
     near: float | None = None,
     backend: str = "auto",
 ) -> LiftedMask:
@@ -107,6 +108,8 @@ def lift_masks(
         masks: (h, w) of each view, bool or floating in [0, 1], of the camera's aspect ratio at any
             size. Everything unmarked is outside, so each mask must cover the object's visible part
             completely.
+        kept: (h, w) bool of each view, at the size of its mask, or None: False where the view's
+            picture is to be ignored, so that its pixels have no vote.
         near: near-plane depth, in scene units; by default a hundredth of the splats' median
             distance in each view.
         backend: renderer name, as for :func:`attnwarp.render.render`.
@@ -152,8 +155,12 @@ def lift_masks(
     count = len(splats)
     marked, weight, trust = (np.zeros(count) for _ in range(3))
     inside, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    for mask, view in zip(checked, views, strict=True):
-        votes, total = _votes(splats, mask, _counted(mask), view, near, backend)
+    voting = [
+        np.ones(mask.shape, dtype=bool) if part is None else part
+        for mask, part in zip(checked, kept or [None] * len(checked), strict=True)
+    ]
+    for mask, part, view in zip(checked, voting, views, strict=True):
+        votes, total = _votes(splats, mask, _counted(mask) & part, view, near, backend)
         share = np.minimum(1, total / footprints(splats, view))
         counts = share >= SEEN
         marked += np.where(counts, votes, 0)
@@ -166,9 +173,9 @@ def lift_masks(
     vote = np.where(seen, marked / np.maximum(weight, np.finfo(float).tiny), 0)
     membership, reached = _settled(splats, vote, TRUST * trust**2)
     agreement = []
-    for mask, view in zip(checked, views, strict=True):
-        mine = _shown(splats, membership, view, near, backend) > 0.5
-        given = mask > 0.5
+    for mask, part, view in zip(checked, voting, views, strict=True):
+        mine = part & (_shown(splats, membership, view, near, backend) > 0.5)
+        given = part & (mask > 0.5)
         union = int((mine | given).sum())
         agreement.append(int((mine & given).sum()) / union if union else float("nan"))
     return LiftedMask(

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
+from attnwarp.fit import Views
+from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_ply, write_splat
 from attnwarp.io.file import write_atomically
@@ -28,8 +29,8 @@ from attnwarp.methods.base import VIEWER_PLY, edit_file
 from attnwarp.methods.change import say_change, say_drift, say_little
 from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
 from attnwarp.methods.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
-from attnwarp.methods.pictures import Bytes, resized, to_bytes
-from attnwarp.methods.scene import Scene, near_of, to_float
+from attnwarp.methods.pictures import Bytes, Mask, resized, to_bytes
+from attnwarp.methods.scene import near_of
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST, Workdir
 
@@ -56,8 +57,7 @@ RENDERS = ("renders/before", "renders/after")
 def show_edit(
     folder: Workdir,
     before: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]],
+    views: Views,
     *,
     editor: Editor | None = None,
     turntable: Path | None = None,
@@ -68,17 +68,16 @@ def show_edit(
     """Write the page of a finished edit, ``index.html``, from its folder's files.
 
     Args:
-        images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
+        views: photographs and cameras of the views.
         editor: editor of the control, which edits the page's views alone; None for no control.
         turntable: file of the orbit's film, GIF or MP4; None for no film.
         origin: sentence on the origin of the inputs, without its full stop.
     """
-    page = _Page(folder, cameras, images, before)
+    page = _Page(folder, views, before)
     # A method that edits views alone needs no control.
     if editor is not None and page.manifest["method"] != "by_view":
-        views = [page.names.index(name) for name in page.shown]
-        scene = Scene.checked(cameras, images, page.segments)
-        edited_alone(folder, before, scene, editor, views, report)
+        shown = [page.names.index(name) for name in page.shown]
+        edited_alone(folder, before, views, page.segments, editor, shown, report)
     turns = [renders(model, page.turn) for model in (before, page.after)]
     if turntable is not None:
         write_film(turntable, *turns)
@@ -99,17 +98,11 @@ def show_edit(
 class _Page:
     """Parts of a page, each as HTML."""
 
-    def __init__(
-        self,
-        folder: Workdir,
-        cameras: Sequence[Camera],
-        images: Sequence[npt.NDArray[Any]],
-        before: Gaussians,
-    ) -> None:
-        self.folder, self.cameras, self.before = folder, cameras, before
+    def __init__(self, folder: Workdir, views: Views, before: Gaussians) -> None:
+        self.folder, self.photographs, self.before = folder, views, before
+        cameras = self.cameras = views.cameras
         self.manifest, self.result = folder.read_json(MANIFEST), folder.read_json("result.json")
         self.names = file_stems(cameras)
-        self.photographs = dict(zip(self.names, images, strict=True))
         # A run ended by its budget lacks the last planned views.
         self.edited = [name for name in self.names if folder.has(f"views/{name}.png")]
         source = self.manifest.get("source")
@@ -284,7 +277,7 @@ class _Page:
             return to_bytes(resized(to_float(pixels), sizes[name]))
 
         pictures: dict[str, dict[int, Bytes]] = {
-            "photographs": {index[n]: at_size(n, self.photographs[n]) for n in self.shown}
+            "photographs": {k: at_size(n, self.photographs.picture(k)) for n, k in index.items()}
         }
         parts = {"edited views": "views", "each edited alone": CONTROL, "edited scene": RENDERS[1]}
         for title, part in parts.items():
@@ -293,13 +286,20 @@ class _Page:
                 index[n]: at_size(n, self.folder.read_picture(file)) for n, file in read.items()
             }
         cameras = {index[n]: self.cameras[index[n]].resize(w, h) for n, (h, w) in sizes.items()}
-        masks = self.segments
-        segments = None if masks is None else {
-            index[n]: resized(masks[index[n]][..., None].repeat(3, 2).astype(np.float32), sizes[n])[
-                ..., 0] > 0.5
-            for n in self.shown
-        }  # fmt: skip
-        values = disagreement(self.before, cameras, pictures, segments)
+
+        def at_edit(masks: Sequence[npt.NDArray[np.bool_] | None]) -> dict[int, Mask]:
+            """Resize the shown views' masks to the sizes of their edits."""
+            given = {n: mask for n, k in index.items() if (mask := masks[k]) is not None}
+            return {
+                index[n]: resized(
+                    mask[..., None].repeat(3, 2).astype(np.float32), sizes[n]
+                )[..., 0] > 0.5
+                for n, mask in given.items()
+            }  # fmt: skip
+
+        segments = None if self.segments is None else at_edit(self.segments)
+        kept = at_edit(self.photographs.masks)
+        values = disagreement(self.before, cameras, pictures, segments, kept)
         if "edited views" not in values:
             return ""
         where = "" if segments is None else " inside the mask"
@@ -345,7 +345,7 @@ class _Page:
     def _lit(self, name: str) -> Bytes:
         """Darken the photograph outside the mask."""
         mask = self.folder.read_picture(f"segments/{name}.png") / 255
-        lit: Bytes = to_bytes(to_float(self.photographs[name]) * (0.2 + 0.8 * mask))
+        lit: Bytes = to_bytes(self.photographs.picture(self.names.index(name)) * (0.2 + 0.8 * mask))
         return lit
 
     def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
@@ -387,7 +387,7 @@ class _Page:
     def _photograph(self, name: str) -> Bytes:
         """Return a view before its edit, at the size of its edit."""
         h, w = self.folder.read_picture(f"views/{name}.png").shape[:2]
-        return to_bytes(resized(to_float(self.photographs[name]), (h, w)))
+        return to_bytes(resized(self.photographs.picture(self.names.index(name)), (h, w)))
 
     def _read(self, file: str) -> Bytes | None:
         return self.folder.read_picture(file) if self.folder.has(file) else None

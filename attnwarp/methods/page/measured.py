@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from itertools import groupby, permutations
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,14 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
+from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.attention_warping import AttentionWarping
 from attnwarp.methods.base import ViewEdit
 from attnwarp.methods.by_view import ByView
-from attnwarp.methods.pictures import Bytes, to_bytes
-from attnwarp.methods.scene import Scene, near_of
+from attnwarp.methods.pictures import Bytes, Segment, to_bytes
+from attnwarp.methods.scene import near_of
 from attnwarp.methods.settings import (
     AttentionWarpingSettings,
     ByViewSettings,
@@ -38,7 +40,8 @@ CONTROL = "control"
 def edited_alone(
     folder: Workdir,
     gaussians: Gaussians,
-    scene: Scene,
+    scene: Views,
+    segments: list[Segment] | None,
     editor: Editor,
     views: Sequence[int],
     report: Reporter,
@@ -57,7 +60,9 @@ def edited_alone(
 
     def work_with(settings: MethodSettings) -> Work:
         instruction = manifest["instruction"]
-        return Work(gaussians, scene, editor, instruction, settings, "auto", folder, report)
+        return Work(
+            gaussians, scene, editor, instruction, settings, "auto", folder, report, segments
+        )
 
     edits: list[tuple[Sequence[int], Callable[..., list[ViewEdit]]]] = []
     given = manifest["settings"]
@@ -89,6 +94,7 @@ def disagreement(
     cameras: Mapping[int, Camera],
     pictures: Mapping[str, Mapping[int, Bytes]],
     segments: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+    kept: Mapping[int, npt.NDArray[np.bool_]] = MappingProxyType({}),
 ) -> dict[str, float]:
     """Average the difference between pictures of one surface point over all ordered pairs of views,
     at correspondences of rendered splats accepted by the preset ``corrected``.
@@ -97,6 +103,7 @@ def disagreement(
         cameras: cameras of the views, at the size of their pictures.
         pictures: (H, W, 3) uint8 of each view, by kind of picture.
         segments: (H, W) bool of each view: the pixels that count.
+        kept: (H, W) bool of views with a mask: False where the picture is to be ignored.
 
     Returns:
         Mean absolute difference as a share of the full range, by kind of picture; a kind without
@@ -117,6 +124,11 @@ def disagreement(
         counted = warp.mask.numpy()
         if segments is not None:
             counted = counted & segments[target]
+        if target in kept:
+            counted = counted & kept[target]
+        if source in kept:
+            share = sample_at(torch.from_numpy(kept[source])[None].double(), warp.correspondence.xy)
+            counted = counted & (share[0] > 0.5).numpy()
         for name, of_view in pictures.items():
             if not {source, target} <= of_view.keys():
                 continue

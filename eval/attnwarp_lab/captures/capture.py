@@ -8,8 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy.typing as npt
-
 from attnwarp.camera import Camera
 from attnwarp.cli.files import check_seen, likeness
 from attnwarp.digest import digest
@@ -20,7 +18,6 @@ from attnwarp.io import Dataset, read_dataset, read_ply
 from attnwarp.methods.command import marked, view_of
 from attnwarp.methods.marks import Marks
 from attnwarp.methods.pictures import Segment
-from attnwarp.methods.scene import images_of
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_lab.captures.manifest import Loaded, MaskPart
 
@@ -38,14 +35,12 @@ class Ready:
     Attributes:
         dataset: views of the capture.
         views: pictures and cameras at the manifest's size.
-        images: (H, W, 3) of each view, over black.
         source: number of the source view.
         content: SHA-256 of the pictures, the cameras and their names, and the source's number.
     """
 
     dataset: Dataset
     views: Views
-    images: list[npt.NDArray[Any]]
     source: int
     content: str
 
@@ -82,7 +77,7 @@ def _read(
     views = load_views(dataset, max_size=max_size, damaged="error")
     index = view_of(dataset, source)
     content = digest([views.digest, [camera.name for camera in views.cameras], index])
-    return Ready(dataset, views, images_of(views), index, content)
+    return Ready(dataset, views, index, content)
 
 
 def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) -> None:
@@ -144,6 +139,6 @@ def segments(
     """
     capture, marks = ready(loaded, name), marks_of(loaded, name)
     return marked(
-        marks, "", capture.dataset, capture.views, capture.images, capture.source,
+        marks, "", capture.dataset, capture.views, capture.source,
         run / MARKS / name, device, report,
     )  # fmt: skip

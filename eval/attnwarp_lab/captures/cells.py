@@ -20,12 +20,13 @@ import torch
 from attnwarp.editing.small import dtype_of, guide_of, load_editor, own_steps_of, thread_count
 from attnwarp.encoders import Kind, load_encoder
 from attnwarp.errors import InputError
+from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods import METHODS, Budget
 from attnwarp.methods.base import workdir_of
 from attnwarp.methods.page import PAGE, show_edit
 from attnwarp.methods.pictures import enlarged_change, to_bytes
-from attnwarp.methods.scene import near_of, render_picture, to_float
+from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST
 from attnwarp_eval.canonical_json import without_nan
@@ -212,7 +213,7 @@ class Job:
         _reset_gpu(self.device)
         result, before = self.run_method()
         originals = self.run / ORIGINALS / self.cell.scene
-        images = [to_float(image) for image in capture.images]
+        images = [capture.views.picture(k) for k in range(len(capture.views))]
         near = near_of(capture.cameras, before)
         for k, camera in enumerate(capture.cameras):
             _write(originals, k, images[k])
@@ -224,7 +225,7 @@ class Job:
         if method.has(MANIFEST):  # an external method leaves no such folder
             page = (method.path / PAGE).relative_to(self.run).as_posix()
             if not method.has(PAGE):
-                show_edit(method, before, capture.cameras, images)
+                show_edit(method, before, capture.views)
         counts = {
             "views": len(capture.cameras), "edited": len(result.edited),
             **{k: result.counters[k] for k in COUNTED if k in result.counters},
@@ -246,9 +247,10 @@ class Job:
         compile_kernels(splats.kind, self.report, self.device)
         marked = segments(self.loaded, self.cell.scene, self.run, self.device, self.report)
         job = editing_methods.Job(
-            splats, capture.cameras, capture.images, editor, spec["text"], spec["settings"],
+            splats, capture.cameras, capture.views.images, editor, spec["text"], spec["settings"],
             self.folder() / "run", None, {}, self.budget or Budget.from_dict(row.budget),
-            segments=marked(splats), source=capture.source, report=self.report, load=encoder_of,
+            segments=marked(splats), source=capture.source, masks=capture.views.masks,
+            report=self.report, load=encoder_of,
         )  # fmt: skip
         return EDITING_METHODS[spec["method"]].run(job), splats
 
@@ -296,8 +298,8 @@ class Job:
         from attnwarp_eval.study.shared.pictures import carried
 
         capture, folder, target = self.capture, self.folder(), self.cell.spec["target"]
-        source = to_float(capture.images[capture.source])
-        truth = to_float(capture.images[target])
+        source = capture.views.picture(capture.source)
+        truth = capture.views.picture(target)
         figures: dict[str, float] = {}
         for kind in ("2d", "3d"):
             splats = self.splats(kind)

@@ -612,23 +612,23 @@ def test_segments_leave_the_original_or_black_outside(scene, editor):
 def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
     how, scene, editor, monkeypatch
 ):
-    tuned, advance = [], Tuning.advance
+    tuned, advance = {}, Tuning.advance
 
-    def watched(tuning, begin, end, views, *more, **options):
-        tuned.extend(views)
-        advance(tuning, begin, end, views, *more, **options)
+    def watched(tuning, begin, end, views, numbers, *more, **options):
+        tuned.update(zip(numbers, views.images, strict=True))
+        advance(tuning, begin, end, views, numbers, *more, **options)
 
     monkeypatch.setattr(Tuning, "advance", watched)
     left = np.zeros((32, 32), dtype=bool)
     left[:, :15] = True  # ends within a pixel of the edit
     settings = replace(QUICK, stages=1, steps=1, iterations=0, size=16, composite=how)
     result = run(scene, editor, settings=settings, segments=[left] * 5)
-    assert {view.number for view in tuned} == {*plan(result).edited}
-    for view in tuned:
-        before = scene[2][view.number]
+    assert tuned.keys() == {*plan(result).edited}
+    for view, picture in tuned.items():
+        before = scene[2][view]
         outside = before if how == "original" else 0 * before
-        assert np.array_equal(view.picture[:, 15:], outside[:, 15:])
-        assert np.abs(view.picture - before)[:, :15].max() > 0.1
+        assert np.array_equal(picture[:, 15:], outside[:, 15:])
+        assert np.abs(picture - before)[:, :15].max() > 0.1
 
 
 def test_a_picture_edited_by_hand_is_the_source(scene, editor):

@@ -29,12 +29,14 @@ from attnwarp import Camera, Gaussians
 from attnwarp.cli.main import app
 from attnwarp.editing.segment import GroundedSam, cut_out, snap
 from attnwarp.errors import InputError
+from attnwarp.fit.views import to_float
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 from attnwarp.methods import PRESETS
 from attnwarp.methods.command import _masks, mask_files
 from attnwarp.methods.marks import Marks, check_middle, mask_by_words, read_mask, read_over_black
-from attnwarp.methods.scene import near_of, to_float
+from attnwarp.methods.scene import near_of
+from attnwarp.methods.tuning import Tuning
 from attnwarp.render import render
 from attnwarp.warp import lift_masks, piece_around
 
@@ -182,6 +184,38 @@ def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):
     # Far less than the 30 seconds between two checkpoints have passed.
     assert (tmp_path / "fit" / "checkpoint.pt").is_file()
     assert "the same command goes on from it" in result.output
+
+
+def test_a_captures_masks_and_its_fits_exposures_hold_in_the_edit(place, tmp_path, monkeypatch):
+    """Oracles: the masks' files, and pictures taken at half and at full exposure."""
+    data = shutil.copytree(place / "data", tmp_path / "data")
+    for k, path in enumerate(sorted((data / "images").iterdir())):
+        path.write_bytes(encode_png(read_image(path) // (1 + k % 2)))
+    save_mask(LEFT, data / "mask.png")
+    scene = json.loads((data / "transforms.json").read_text())
+    scene["frames"][1]["mask_path"] = "mask.png"
+    (data / "transforms.json").write_text(json.dumps(scene))
+    fitted = ["--iterations", 60, "--hold-out", 0, "--set", "exposure=true", "--kind", "2dgs"]
+    done = runner.invoke(app, ["fit", str(data), "--out", str(tmp_path / "fit"), *map(str, fitted)])
+    assert done.exit_code == 0, done.output
+    seen, advance = {}, Tuning.advance
+
+    def watched(tuning, begin, end, views, numbers, *more, **options):
+        seen.update(zip(numbers, zip(views.masks, views.exposures, strict=True), strict=True))
+        advance(tuning, begin, end, views, numbers, *more, **options)
+
+    monkeypatch.setattr(Tuning, "advance", watched)
+    ply = ("--ply", tmp_path / "fit" / "splats.ply")
+    result = run(tmp_path, tmp_path / "out", *ply, "--editor", place / "editor")
+    assert result.exit_code == 0, result.output
+    assert len(seen) > 1
+    for view, (mask, change) in seen.items():
+        assert np.array_equal(mask, LEFT) if view == 1 else mask is None
+        grey = np.full(3, 0.5)
+        assert ((grey + change[:, :3] @ grey + change[:, 3]).mean() < 0.5) == (view % 2 == 1)
+    only_ignored = ("--ply", place / "splats.ply", "--source", 1, "--box", "20,4,30,28")
+    refused = run(tmp_path, tmp_path / "none", *only_ignored, "--editor", place / "editor")
+    assert refused.exit_code == 2 and "marks only what the capture's mask" in refused.output
 
 
 def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):

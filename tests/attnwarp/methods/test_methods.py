@@ -96,6 +96,24 @@ def test_identical_views_with_shared_noise_get_identical_edits(name, run, scene)
         assert not any(close(first, other) for other in others)
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_splats_seen_only_where_masks_ignore_the_pictures_keep_their_bytes(name, run, scene):
+    """Oracle: a loss that reads no pixel of a splat has no gradient in it, and Adam takes no step."""
+    model, views, images = scene
+    right = np.arange(32)[None].repeat(32, 0) >= 26
+    magenta = [np.where(right[..., None], image, np.float32([1, 0, 1])) for image in images]
+    hidden = model.means[:, 0] < -0.7
+    quick = replace(QUICK[name], normal=0.0, distortion=0.0)
+
+    def changed(**masks):
+        tuned = run(name, quick, (model, views, magenta), **masks).gaussians
+        return (tuned.sh != model.sh).any(dim=(1, 2))
+
+    assert hidden.sum() == 3
+    assert not changed(masks=[right] * 3)[hidden].any()
+    assert changed()[hidden].all()
+
+
 def test_view_by_view_with_shared_noise_is_the_editors_own_loop(run, scene, editor):
     settings = replace(QUICK["by_view"], noise="shared", iterations=0, batch=1, seed=4)
     result = run("by_view", settings)
@@ -187,10 +205,10 @@ def test_igs2gs_edits_every_view_in_every_round_from_the_render_as_tuned(
 
 
 def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
-    from attnwarp.methods.scene import Scene
+    from attnwarp.fit import Views
 
     model, views, images = scene
-    work = work_of(model, Scene.checked(views, images, None), editor, IGS2GSSettings())
+    work = work_of(model, Views(views, images), editor, IGS2GSSettings())
     drawn = [work.timestep(number, view, (20, 29)) for number in range(100) for view in range(10)]
     counts = np.bincount(drawn, minlength=30)
     assert counts[:20].sum() == 0
@@ -203,7 +221,7 @@ def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
 
 def test_depth_shows_no_splat_that_no_picture_shows(editor):
     """Oracle: the plane of the wall. A disc hangs 0.1 before the first of two cameras 40 apart."""
-    from attnwarp.methods.scene import Scene
+    from attnwarp.fit import Views
 
     view = {"width": 32, "height": 32, "fov_y": 40, "up": (0, 1, 0)}
     views = [Camera.look_at((x, 0, 20), (x, 0, 0), **view) for x in (-20.0, 20.0)]
@@ -215,7 +233,7 @@ def test_depth_shows_no_splat_that_no_picture_shows(editor):
         torch.ones(2),
         torch.zeros(2, 1, 3),
     )
-    scene = Scene.checked(views, [np.zeros((32, 32, 3), np.uint8)] * 2, None)
+    scene = Views(views, [np.zeros((32, 32, 3), np.uint8)] * 2)
     work = work_of(discs, scene, editor, ByViewSettings())
     assert np.allclose(work.depth(0, discs), 20, rtol=1e-4)
 

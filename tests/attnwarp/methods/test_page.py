@@ -13,6 +13,7 @@ from PIL import Image
 
 from attnwarp import Camera
 from attnwarp.errors import InputError
+from attnwarp.fit import Views
 from attnwarp.io import read_image, read_splat
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, attention_warping, by_view, preset
@@ -53,7 +54,7 @@ def edits(scene, editor, tmp_path_factory):
         METHODS[method](
             model, cameras, pictures, editor, "red", settings, folder=folder, segments=segments
         )
-        path = pages.show_edit(workdir_of(folder), model, cameras, images, editor=editor)
+        path = pages.show_edit(workdir_of(folder), model, Views(cameras, images), editor=editor)
         return folder, path.read_text()
 
     return made
@@ -121,7 +122,7 @@ def test_the_splats_on_the_page_are_the_edited_ones(warped, tmp_path):
 def test_of_too_many_splats_those_that_cover_most_are_on_the_page(warped, scene, monkeypatch):
     folder, _ = warped
     monkeypatch.setattr(pages, "MOST_SPLATS", 7)
-    text = pages.show_edit(workdir_of(folder), *scene).read_text()
+    text = pages.show_edit(workdir_of(folder), scene[0], Views(*scene[1:])).read_text()
     assert "7 of 60 splats" in text
     data = b64decode(re.search(r'id="splat-bytes">(.*?)<', text)[1])
     assert len(data) == 7 * 32
@@ -160,7 +161,7 @@ def test_the_page_says_so_where_views_edited_alone_agree_as_well(warped, scene, 
         shape = read_image(path).shape
         flat, noisy = np.full(shape, 90, np.uint8), noise.integers(0, 256, shape, np.uint8)
         Image.fromarray(flat if agree else noisy).save(path)
-    text = pages.show_edit(workdir_of(folder), *scene).read_text()
+    text = pages.show_edit(workdir_of(folder), scene[0], Views(*scene[1:])).read_text()
     assert "each edited alone" in text
     assert ("the views agree as well" in text) == agree
 

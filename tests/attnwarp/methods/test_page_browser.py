@@ -9,6 +9,7 @@ import pytest
 from tiny_scenes import splats as discs
 
 from attnwarp import Camera
+from attnwarp.fit import Views
 from attnwarp.io import read_ply
 from attnwarp.methods import by_view, preset
 from attnwarp.methods.base import workdir_of
@@ -62,7 +63,11 @@ def edit(scene, editor, tmp_path_factory):
     model = discs()
     settings = preset("by_view", steps=2, iterations=3)
     by_view(model, cameras, images, editor, "make it red", settings, folder=folder)
-    return folder, cameras, show_edit(workdir_of(folder), model, cameras, images, editor=editor)
+    return (
+        folder,
+        cameras,
+        show_edit(workdir_of(folder), model, Views(cameras, images), editor=editor),
+    )
 
 
 def opened(page, width):

@@ -13,11 +13,11 @@ from attnwarp import Camera
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.layers import BareUNet, all_layers
 from attnwarp.editing.schedule import DDIM
+from attnwarp.fit import Views
 from attnwarp.methods import ByViewSettings, GuidedSettings
 from attnwarp.methods.corresponding import mixing
 from attnwarp.methods.fused import blended, guided_by, splat
 from attnwarp.methods.guided import Guided, guided_step, mosaic
-from attnwarp.methods.scene import Scene
 from attnwarp.methods.warped_reference import WarpedReference
 from attnwarp.methods.work import Work
 from attnwarp.reporting import SILENT
@@ -276,7 +276,7 @@ def test_the_loss_is_l1_and_twice_the_distance_of_patches_at_matched_points(scen
     model, views, images = scene
     twins = [Camera(views[1].K, views[1].world_to_camera, 32, 32, f"{k}.png") for k in range(2)]
     settings = GuidedSettings(patches=10, patch=128)
-    seen = Scene.checked(twins, [images[1]] * 2, None)
+    seen = Views(twins, [images[1]] * 2)
     folder = Workdir(Path("unused"), "an edit")
     work = Work(model, seen, editor, "a bear", settings, "auto", folder, SILENT)
     guide = Guided(work, settings, 0, None)
@@ -312,7 +312,7 @@ def test_a_start_from_a_white_edit_is_white_and_no_more(scene, editor):
     model, views, images = scene
     settings = QUICK["warped_reference"]
     folder = Workdir(Path("unused"), "an edit")
-    seen = Scene.checked(views, images, None)
+    seen = Views(views, images)
     work = Work(model, seen, editor, "a bear", settings, "auto", folder, SILENT)
     method = WarpedReference(work, settings, 0, None)
     method.kept = lambda number, view: np.ones((32, 32, 3), np.float32)

@@ -9,10 +9,11 @@ from tiny_scenes import cameras, pictures, splats
 
 from attnwarp import Camera
 from attnwarp.encoders import load_encoder
+from attnwarp.fit import Views
 from attnwarp.methods import preset
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.methods.stages import released_order
-from attnwarp.methods.tuning import DistanceToViews, TrainingView, Tuning
+from attnwarp.methods.tuning import DistanceToViews, Tuning
 from attnwarp.render import render
 from attnwarp.workdir import Workdir
 
@@ -21,17 +22,17 @@ SETTINGS = preset("attention_warping", iterations=40)
 
 def views_of(count, size=32):
     place = cameras(1)[0]
-    return [TrainingView(k, place, np.zeros((size, size, 3), np.float32)) for k in range(count)]
+    return Views([place] * count, [np.zeros((size, size, 3), np.float32)] * count)
 
 
 def visited(count, order=None, iterations=400):
     tuning = Tuning(splats(), cameras(), replace(SETTINGS, perceptual=0.0), iterations)
     views, seen = views_of(count), []
-    tuning._iterate = lambda view: (
-        seen.append(view.number),
+    tuning._iterate = lambda views, index: (
+        seen.append(index),
         setattr(tuning, "iteration", len(seen)),
     )
-    tuning.advance(0, iterations, views, order)
+    tuning.advance(0, iterations, views, range(count), order)
     return seen
 
 
@@ -52,36 +53,31 @@ def test_otherwise_every_view_is_visited_once_in_each_round():
 def test_tuning_recolours_the_scene_to_its_pictures():
     start, views = splats(), cameras()
     goal = replace(start, sh=start.sh.flip(-1))  # red and blue exchanged
-    training = [
-        TrainingView(k, camera, picture)
-        for k, (camera, picture) in enumerate(zip(views, pictures(goal, views), strict=True))
-    ]
+    training = Views(views, pictures(goal, views))
     tuning = Tuning(start, views, replace(SETTINGS, color_rate=20.0), 250)
 
     def error():
         return sum(
-            float((render(tuning.gaussians(), v.camera).color - torch.from_numpy(v.picture)).abs().mean())
-            for v in training
+            float((render(tuning.gaussians(), camera).color - torch.from_numpy(picture)).abs().mean())
+            for camera, picture in zip(views, training.images, strict=True)
         )  # fmt: skip
 
     before = error()
-    tuning.advance(0, 250, training)
+    tuning.advance(0, 250, training, range(len(views)))
     assert error() < 0.3 * before
     assert sum(tuning.visits.values()) == 250
 
 
 def test_a_splat_takes_the_share_of_a_step_that_it_belongs():
     start, views = splats(), cameras()
-    target = [
-        TrainingView(k, c, np.ones((c.height, c.width, 3), np.float32)) for k, c in enumerate(views)
-    ]
+    target = Views(views, [np.ones((c.height, c.width, 3), np.float32) for c in views])
     share = np.tile([0.0, 0.25, 1.0], len(start))[: len(start)]
 
     def moved(steps, membership=None):
         settings = replace(SETTINGS, perceptual=0.0)
         tuning = Tuning(start, views, settings, steps, membership=membership)
         origin = {name: tensor.detach().clone() for name, tensor in tuning.model.tensors.items()}
-        tuning.advance(0, steps, target, lambda number: number % len(target))
+        tuning.advance(0, steps, target, range(len(views)), lambda number: number % len(target))
         return {n: t.detach() - origin[n] for n, t in tuning.model.tensors.items()}
 
     whole, parts = moved(1), moved(1, share)
@@ -117,6 +113,32 @@ def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
         net.net.float()
 
 
+def test_tuning_ignores_what_masks_ignore_and_knows_the_exposure_of_each_picture():
+    """Oracles: the same bits whatever is under a mask; pictures that are exposed renders, which
+    leave the splats as they are."""
+    start, views = splats(), cameras()
+    shown = pictures(start, views)
+    kept = np.arange(32)[None].repeat(32, 0) > 9
+    change = np.array([[-0.1, 0, 0, 0.05], [0, -0.2, 0, 0], [0, 0.1, -0.2, 0.02]])
+    behind = [np.where(kept[..., None], p, np.float32(v)) for p in shown for v in (0, 1)]
+
+    def tuned(images, steps=6, **more):
+        settings = replace(SETTINGS, ssim=0.2, background="black")
+        tuning = Tuning(start, views, settings, steps)
+        tuning.advance(0, steps, Views(views, images, **more), range(len(views)))
+        return tuning.gaussians().sh
+
+    masks = [kept] * len(views)
+    black, white = (tuned(behind[k::2], masks=masks) for k in (0, 1))
+    assert torch.equal(black, white) and not torch.equal(black, tuned(behind[::2]))
+    exposed = [np.float32(p + p @ change[:, :3].T + change[:, 3]) for p in shown]
+    views_of = Views(views, exposed, exposures=[change] * len(views))
+    tuning = Tuning(start, views, replace(SETTINGS, normal=0.0, distortion=0.0), 1)
+    loss = [float(tuning.loss_of(render(start, c), views_of, k)) for k, c in enumerate(views)]
+    plain = float(tuning.loss_of(render(start, views[0]), Views(views, exposed), 0))
+    assert max(loss) < 1e-4 < 1e-2 < plain
+
+
 class Counting:
     """A perceptual distance that counts the pictures that go through its network."""
 
@@ -135,15 +157,14 @@ class Counting:
 def test_a_views_picture_goes_through_the_network_once_while_it_fits(kept, passes):
     net, random = Counting(), torch.Generator().manual_seed(1)
     place = cameras(1)[0]
-    views = [
-        TrainingView(k, place, torch.rand((32, 32, 3), generator=random).numpy()) for k in range(3)
-    ]
+    images = [torch.rand((32, 32, 3), generator=random).numpy() for _ in range(3)]
+    views = Views([place] * 3, images)
     distance = DistanceToViews(net, kept)
     for _ in range(4):
-        for view in views:
+        for k, image in enumerate(images):
             render = torch.rand((32, 32, 3), generator=random).requires_grad_(True)
-            found = distance(render, view)
-            expected = net.net.loss(render, torch.from_numpy(view.picture))
+            found = distance(render, views, k)
+            expected = net.net.loss(render, torch.from_numpy(image))
             assert torch.equal(found, expected)
             slopes = [torch.autograd.grad(value, render)[0] for value in (found, expected)]
             assert torch.equal(*slopes)
@@ -155,8 +176,8 @@ def test_features_of_a_view_go_with_it():
     net = Counting()
     distance = DistanceToViews(net)
     picture = torch.zeros((32, 32, 3))
-    for number in range(3):
-        distance(picture, TrainingView(number, cameras(1)[0], picture.numpy()))
+    for _ in range(3):
+        distance(picture, Views(cameras(1), [picture.numpy()]), 0)
         assert len(distance._kept) == 0
     assert net.pictures == 6
 
@@ -169,9 +190,9 @@ def test_views_from_one_place_are_drawn_and_tuned_alike_in_any_unit(unit):
     def tuned(k):
         start = replace(splats(), means=k * splats().means, scales=k * splats().scales)
         view = Camera.look_at(k * position, (0, 0, 0), width=32, height=32, fov_y=40, up=(0, 1, 0))
-        target = TrainingView(0, view, np.zeros((32, 32, 3), np.float32))
+        target = Views([view], [np.zeros((32, 32, 3), np.float32)])
         tuning = Tuning(start, [view], replace(SETTINGS, perceptual=0.0), 3)
-        tuning.advance(0, 3, [target])
+        tuning.advance(0, 3, target, [0])
         return render_picture(start, view, near_of([view], start), "auto"), tuning.gaussians()
 
     (drawn, one), (other_drawn, other) = tuned(1.0), tuned(unit)

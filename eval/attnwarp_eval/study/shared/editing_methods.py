@@ -92,6 +92,8 @@ class Job:
             source's.
         segments: (H, W) share of each view that is edited, outside which nothing may change; None
             for everywhere.
+        masks: (H, W) bool of each view, or None: False where its picture is to be ignored; see
+            :class:`attnwarp.fit.Views`.
         report: receives how the method stands.
         load: gives encoders, as :func:`attnwarp.encoders.load_encoder`.
     """
@@ -109,6 +111,7 @@ class Job:
     donor: Donor | None = None
     segments: Sequence[npt.NDArray[Any]] | None = None
     source: int = 0
+    masks: Sequence[npt.NDArray[np.bool_] | None] = ()
     report: Reporter = SILENT
     load: Callable[..., Any] = load_encoder
 
@@ -117,7 +120,7 @@ class Job:
         """Options that every method of the library takes by name."""
         return {
             "folder": self.folder, "budget": self.budget, "segments": self.segments,
-            "report": self.report, "load": self.load,
+            "masks": self.masks, "report": self.report, "load": self.load,
         }  # fmt: skip
 
 
