@@ -114,6 +114,31 @@ def peak_memory(device: str) -> str:
     return f", at most {torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB of the GPU"
 
 
+def with_gradients(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function so that it can differentiate what it computes, whether the caller has
+    turned gradients off (``torch.no_grad``, ``torch.inference_mode``) or not.
+
+    Example:
+        >>> import torch
+        >>> @with_gradients
+        ... def slope():
+        ...     x = torch.ones(2, requires_grad=True)
+        ...     return torch.autograd.grad(x.square().sum(), x)[0].tolist()
+        >>> with torch.inference_mode():
+        ...     slope()
+        [2.0, 2.0]
+    """
+
+    @wraps(function)
+    def called(*arguments: P.args, **named: P.kwargs) -> T:
+        import torch
+
+        with torch.inference_mode(False), torch.enable_grad():
+            return function(*arguments, **named)
+
+    return called
+
+
 def on_cpu_unless_named(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function so that tensors without a named device are created on the CPU, even if
     the process's default differs (``torch.set_default_device``).

@@ -12,7 +12,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.devices import on_cpu_unless_named, type_of
+from attnwarp.devices import on_cpu_unless_named, type_of, with_gradients
 from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.process import core_count
 
@@ -245,6 +245,7 @@ def _pair(folders: str) -> tuple[Path, Path]:
 
 
 @on_cpu_unless_named
+@with_gradients
 def load_editor(name_or_folder: str, **settings: Any) -> Editor:
     """Load an editor by name, such as "small-plain", or from folders in diffusers' format.
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check, losses
-from attnwarp.devices import on_cpu_unless_named
+from attnwarp.devices import on_cpu_unless_named, with_gradients
 from attnwarp.errors import InputWarning
 from attnwarp.fit.densify import Density
 from attnwarp.fit.exposure import Exposure
@@ -124,6 +124,7 @@ class Fit:
 
 
 @on_cpu_unless_named
+@with_gradients
 def fit(
     start: Gaussians,
     views: Views,

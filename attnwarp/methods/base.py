@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from attnwarp import check, losses
 from attnwarp.camera import Camera
-from attnwarp.devices import on_cpu_unless_named
+from attnwarp.devices import on_cpu_unless_named, with_gradients
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.identity import editor_digest
 from attnwarp.encoders import load_encoder
@@ -288,6 +288,7 @@ class Plan:
 
 
 @on_cpu_unless_named
+@with_gradients
 def run(
     name: str,
     make: Callable[[Work, Any], Method],

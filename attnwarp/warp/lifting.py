@@ -19,7 +19,7 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.devices import on_cpu_unless_named
+from attnwarp.devices import on_cpu_unless_named, with_gradients
 from attnwarp.gaussians import SH_C0, Gaussians
 from attnwarp.render import Render, render
 from attnwarp.warp.view import near_plane
@@ -83,6 +83,7 @@ class LiftedMask:
 
 
 @on_cpu_unless_named
+@with_gradients
 def lift_masks(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
@@ -209,10 +210,9 @@ def _votes(
     values = torch.zeros(
         len(splats), 2, dtype=torch.float32, device=splats.means.device, requires_grad=True
     )
-    with torch.enable_grad():
-        picture = _picture(splats, values, camera, near, backend)
-        marks = torch.from_numpy(np.stack([mask * counted, counted], axis=-1))
-        (sums,) = torch.autograd.grad((picture.color * marks.to(picture.color)).sum(), values)
+    picture = _picture(splats, values, camera, near, backend)
+    marks = torch.from_numpy(np.stack([mask * counted, counted], axis=-1))
+    (sums,) = torch.autograd.grad((picture.color * marks.to(picture.color)).sum(), values)
     first, second = sums.double().cpu().numpy().T
     return first, second
 

@@ -1,5 +1,5 @@
-"""Results in a process whose default type of numbers is float64, as some packages set it on import, or
-whose default device is no CPU. The device meta stands for a GPU: it computes nothing.
+"""Results in a process whose default type of numbers is float64, as some packages set it on import, whose
+default device is no CPU, or whose gradients are off. The device meta stands for a GPU: it computes nothing.
 """
 
 import ast
@@ -44,7 +44,9 @@ def meta():
         torch.set_default_device(None)
 
 
-OTHER_PROCESSES = pytest.mark.parametrize("process", [float64, meta])
+OTHER_PROCESSES = pytest.mark.parametrize(
+    "process", [float64, meta, torch.no_grad, torch.inference_mode]
+)
 
 
 def same_splats(a, b):
