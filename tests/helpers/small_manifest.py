@@ -1,6 +1,5 @@
 """A small run on captures: two exported scenes, random models in the published formats, a manifest."""
 
-import copy
 import shutil
 
 import numpy as np
@@ -37,20 +36,8 @@ MANIFEST = {
     },
     "fit": {"iterations": 60, "sh_degree": 0, "max_splats": 3000},
     "seeds": [0],
-    "editors": {
-        "pix2pix": {"folder": "weights/pix2pix", "shapes": {"unet.conv_in.weight": [16, 8, 3, 3]}},
-        "controlnet": {
-            "folder": "weights/base,weights/control",
-            "shapes": {"unet.conv_in.weight": [16, 4, 3, 3]},
-        },
-    },
-    "encoders": {
-        "clip": {
-            "folder": "weights/clip",
-            "shapes": {"vision_model.embeddings.position_embedding.weight": [17, 32]},
-        },
-        "dino": {"folder": "weights/dino", "shapes": {"embeddings.register_tokens": [1, 4, 32]}},
-    },
+    "editors": {"pix2pix": "weights/pix2pix", "controlnet": "weights/base,weights/control"},
+    "encoders": {"clip": "weights/clip", "dino": "weights/dino"},
     "variants": {
         "IGS2GS": {
             "method": "igs2gs", "editor": "pix2pix", "paper": [21.429, 0.267, 0.149, 0.627, 0.841],
@@ -69,27 +56,18 @@ MANIFEST = {
             "options": {**QUICK, "stages": 1, "views_per_stage": 2},
         },
     },
-    "tables": [
-        {"title": "Table 1", "rows": ["IGS2GS", "attention warp", "GaussCtrl"], "against": "attention warp"},
-        {"title": "Ablation", "rows": ["1 stage"]},
-    ],
-    "geometry": 1,
 }  # fmt: skip
 
 
 def write(folder):
-    """The captures, the weights and ``manifest.yaml``."""
+    """The captures, ``manifest.yaml``, and random models in the formats of Stable Diffusion 1.5, a
+    ControlNet, CLIP and DINOv2.
+    """
     for name in SCENES:
         export(
             load_scene(name), folder / "captures" / name, views=VIEWS, size=SIZE, spp=2, points=800
         )
-    write_weights(folder / "weights")
-    save(folder, MANIFEST)
-    return folder
-
-
-def write_weights(weights):
-    """Random models in the formats of Stable Diffusion 1.5, a ControlNet, CLIP and DINOv2."""
+    weights = folder / "weights"
     pix2pix().save_pretrained(weights / "pix2pix")
     controlnet().save_pretrained(weights / "base")
     shutil.move(weights / "base" / "controlnet", weights / "control")
@@ -97,6 +75,8 @@ def write_weights(weights):
     save_clip(weights / "clip")
     (weights / "dino").mkdir()
     save_dino(weights / "dino", registers=True)
+    save(folder, MANIFEST)
+    return folder
 
 
 def save(folder, manifest, name="manifest.yaml"):
@@ -121,25 +101,3 @@ def write_capture(place, turn=0.0):
         cameras.append(camera)
     write_transforms(place / "transforms.json", Dataset(cameras, paths))
     write_ply(place / "scene.ply", splats)
-
-
-def write_small(folder):
-    """Two captures, weights and a manifest."""
-    for name, turn in (("one", 0.0), ("two", 0.3)):
-        write_capture(folder / "captures" / name, turn)
-    write_weights(folder / "weights")
-    small = copy.deepcopy(MANIFEST)
-    small["captures"] = {
-        name: {
-            "data": f"captures/{name}",
-            "splats": {few_splats().kind: f"captures/{name}/scene.ply"},
-            "mask": {"folder": f"captures/{name}/masks"},
-            "edits": {"red": dict(EDIT)},
-        }
-        for name in ("one", "two")
-    }
-    small |= {"geometry": 0}
-    for row in small["variants"].values():
-        row["splats"] = few_splats().kind
-    save(folder, small)
-    return small

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,7 +14,6 @@ from attnwarp_eval.cli.shell import (
     Regression,
     check_not_of_run,
     clear_errors,
-    other_run,
 )
 
 if TYPE_CHECKING:
@@ -67,9 +66,6 @@ def compare(
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
 
-    if (other := other_run(baseline, run)) is not None:
-        _side_by_side(other, baseline, run)
-        return
     with clear_errors():
         outputs = {"--markdown": markdown, "--json": json, "--html": html}
         _check_outputs(baseline, run, outputs, update)
@@ -111,19 +107,6 @@ def compare(
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
     if result.left_out:
         raise fail(f"{run}: only what {baseline} has too was compared", TOO_LITTLE)
-
-
-def _side_by_side(other: Any, one: Path, two: Path) -> None:
-    """Compare two people's runs on captures: differing inputs, and figures."""
-    from rich.console import Console
-
-    from attnwarp_eval.document.write import terminal
-
-    with clear_errors():
-        lines, table = other.side_by_side(one, two)
-    for line in lines or ["same inputs, code and versions"]:
-        typer.echo(line)
-    Console(width=250).print(terminal(table))
 
 
 def _check_outputs(

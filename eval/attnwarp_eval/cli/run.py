@@ -16,7 +16,6 @@ from attnwarp_eval.cli.shell import (
     TOO_LITTLE,
     clear_errors,
     names,
-    other_run,
     resumable,
     scheduler_lost,
     whole_numbers,
@@ -406,11 +405,8 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        if (other := other_run(run)) is not None:
-            problems = other.verify(Store(run))
-        else:
-            problems = verify(Store(run))
-            problems.damaged += wrong_results(Store(run))
+        problems = verify(Store(run))
+        problems.damaged += wrong_results(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),

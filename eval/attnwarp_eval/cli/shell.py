@@ -5,9 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from attnwarp.cli import shell
 from attnwarp.cli.shell import STOPPED, fail
@@ -16,17 +14,6 @@ from attnwarp.process import stops_interrupt
 REGRESSION, TOO_LITTLE = 1, 3
 """Exit codes besides those of attnwarp. 1 is reserved for a regression. A run that measured too
 little, or with an instrument that is not calibrated, is 3."""
-
-
-OTHER_RUNS: dict[str, str] = {}
-"""Runs without a study: marker file of their folders -> the module whose ``verify`` checks one, and
-whose ``side_by_side`` compares two. Packages with commands add theirs."""
-
-
-def other_run(*folders: Path) -> Any:
-    """The module of :data:`OTHER_RUNS` for folders of one kind; None for runs of studies."""
-    modules = [m for mark, m in OTHER_RUNS.items() if all((f / mark).is_file() for f in folders)]
-    return import_module(modules[0]) if modules else None
 
 
 class Regression(SystemExit):

@@ -28,7 +28,7 @@ OLDER = "made by an older version; run it again"
 
 KINDS = {
     "study": "of a study (attnwarp-eval run)",
-    "manifest": "on captures (attnwarp-eval captures, which writes its tables)",
+    "manifest": "on captures (attnwarp-eval captures, which writes its table)",
 }
 """Key of a ``study.json`` that says what its run is of -> words for messages."""
 
@@ -103,7 +103,7 @@ class Store:
         """Check that a run would overwrite only files of runs of its kind.
 
         Args:
-            kind: as for :meth:`read_study`.
+            kind: what the run is of, a key of :data:`KINDS`.
 
         Raises:
             StoreError: the folder has files with a run's names and no study.json, or a run of
@@ -140,11 +140,8 @@ class Store:
         # Keep the study's order: seconds are taken on a scene's first edit.
         write_json(self.root / "study.json", _sealed(study), sort_keys=False)
 
-    def read_study(self, kind: str = "study") -> dict[str, Any]:
-        """The content of ``study.json``.
-
-        Args:
-            kind: what the run is of, a key of :data:`KINDS`.
+    def read_study(self) -> dict[str, Any]:
+        """The content of a study's ``study.json``.
 
         Raises:
             StoreError: the folder is not a run, or one of another kind, an older version wrote it,
@@ -169,7 +166,7 @@ class Store:
                 f"{path}: {problem}; run the study again with --out {self.root}, which writes it"
                 " anew"
             )
-        self._check_kind(study, kind)
+        self._check_kind(study, "study")
         return study
 
     def _check_kind(self, study: Mapping[str, Any], kind: str) -> None:
@@ -267,13 +264,9 @@ class Store:
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 
-    def verify(self, kind: str = "study") -> Problems:
-        """Recompute every hash and compare with the list of expected cells.
-
-        Args:
-            kind: as for :meth:`read_study`.
-        """
-        study = self.read_study(kind)
+    def verify(self) -> Problems:
+        """Recompute every hash and compare with the list of expected cells."""
+        study = self.read_study()
         expected = {c["id"]: c["title"] for c in study["cells"]}
         problems = Problems()
         done = self.done()

@@ -24,8 +24,8 @@ from attnwarp_lab.captures.manifest import Loaded, MaskPart
 LEAST_PSNR = 15.0
 """dB below which renders of splats show another scene than the pictures."""
 
-MARKS, FITS, ORIGINALS, MADE = "marks", "fits", "originals", "made"
-"""Folders of a run: masks from words, fits by the capture's name, pictures, files of cells."""
+MARKS, FITS, ORIGINALS = "marks", "fits", "originals"
+"""Folders of a run: masks from words, fits by the capture's name, pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,6 @@ class Ready:
     def cameras(self) -> list[Camera]:
         """Cameras of the views."""
         return list(self.views.cameras)
-
-    def pictures(self) -> list[Path]:
-        """Files of the views."""
-        return [path for path in self.dataset.image_paths if path is not None]
 
 
 def ready(loaded: Loaded, name: str) -> Ready:

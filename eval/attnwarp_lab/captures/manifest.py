@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     Field,
     StringConstraints,
     ValidationError,
@@ -34,6 +33,9 @@ FIGURES = {
     "CLIP img": "CLIP single-image similarity",
 }
 """Columns of the paper's tables: heading -> title of :mod:`attnwarp_eval.user_images`."""
+
+AUTHORS = {"clip": "clip-whole", "dino": "dinov2-518", "perceptual": "lpips"}
+"""Schemes of encoders in folders, with the preprocessing of the paper's authors."""
 
 KEYS = "docs/measuring/captures.md"
 """File that documents the keys."""
@@ -104,32 +106,12 @@ class Capture(Part):
     edits: Annotated[dict[Words, Edit], Field(min_length=1)]
 
 
-class Weights(Part):
-    """Bundled weights or weights in a folder, and checks of their identity.
-
-    ``shapes`` are shapes of some tensors by name; ``probe`` is the value that ``--dry-run`` prints,
-    and ``sha256`` the hash of the files. Missing ones of the latter two are recorded.
-    """
-
-    folder: str
-    shapes: dict[str, list[int]] = Field(default_factory=dict)
-    probe: float | None = None
-    sha256: str | None = None
-    scheduler: Literal["stable-diffusion", "any"] = "stable-diffusion"
-
-
-AnyWeights = Annotated[
-    Weights, BeforeValidator(lambda v: {"folder": v} if isinstance(v, str) else v)
-]
-"""Weights, or only their name or folder."""
-
-
 class Encoders(Part):
     """Encoders of the figures, and the perceptual distance, which also tunes splats."""
 
-    clip: AnyWeights = Weights(folder="clip-small")
-    dino: AnyWeights = Weights(folder="dino-small")
-    perceptual: AnyWeights = Weights(folder="perceptual-small")
+    clip: str = "clip-small"
+    dino: str = "dino-small"
+    perceptual: str = "perceptual-small"
 
 
 class Row(Part):
@@ -156,14 +138,6 @@ class Row(Part):
         return value
 
 
-class TablePart(Part):
-    """A table: rows by name, and the row that verdicts compare the others with."""
-
-    title: str
-    rows: Annotated[list[str], Field(min_length=1)]
-    against: str | None = None
-
-
 class Manifest(Part):
     """Everything that decides a run on captures."""
 
@@ -174,11 +148,9 @@ class Manifest(Part):
     captures: Annotated[dict[Name, Capture], Field(min_length=1)]
     fit: dict[str, Any] = Field(default_factory=dict)
     seeds: Annotated[list[Whole], Field(min_length=1)] = Field(default_factory=lambda: [0])
-    editors: Annotated[dict[str, AnyWeights], Field(min_length=1)]
+    editors: Annotated[dict[str, str], Field(min_length=1)]
     encoders: Encoders = Encoders()
     variants: Annotated[dict[str, Row], Field(min_length=1)]
-    tables: list[TablePart] = Field(default_factory=list)
-    geometry: Annotated[Whole, Field(ge=0)] = 0
 
 
 @dataclass(frozen=True)
@@ -192,27 +164,16 @@ class Loaded:
         """A path of the manifest."""
         return self.folder / Path(name).expanduser()
 
-    def paths(self) -> list[Path]:
-        """Paths of captures, splats, masks and weights; bundled inputs have none."""
-        names: list[str | None] = []
-        for c in self.manifest.captures.values():
-            mask = c.mask or MaskPart()
-            names += [c.data, c.images, *c.splats.values(), mask.folder, mask.source]
-        for weights in in_folders(self.manifest).values():
-            names += [part.strip() for part in weights.folder.split(",")]
-        return [self.path(name) for name in names if name is not None]
-
     def editor(self, name: str) -> str:
         """An editor of the manifest as :func:`attnwarp.editing.small.load_editor` takes it."""
-        return _from(self.folder, self.manifest.editors[name].folder)
+        return _from(self.folder, self.manifest.editors[name])
 
     def encoder(self, kind: Literal["clip", "dino", "perceptual"]) -> str:
         """An encoder as :func:`attnwarp.encoders.load_encoder` takes it."""
         from attnwarp.encoders import BUNDLED
 
-        folder = str(getattr(self.manifest.encoders, kind).folder)
-        scheme = {"clip": "clip", "dino": "dinov2", "perceptual": "lpips"}[kind]
-        return folder if folder in BUNDLED else f"{scheme}:{self.path(folder)}"
+        folder = str(getattr(self.manifest.encoders, kind))
+        return folder if folder in BUNDLED else f"{AUTHORS[kind]}:{self.path(folder)}"
 
     def seeds(self, row: Row) -> list[int]:
         """Seeds of a row."""
@@ -224,11 +185,6 @@ class Loaded:
             for edit in capture.edits:
                 yield name, edit
 
-    def tables(self) -> list[TablePart]:
-        """The tables; by default one of all variants."""
-        m = self.manifest
-        return m.tables or [TablePart(title="Figures", rows=list(m.variants))]
-
     def changed(self, **changes: Any) -> Loaded:
         """A copy with other values of keys."""
         return Loaded(self.manifest.model_copy(update=changes), self.folder)
@@ -239,7 +195,7 @@ class Loaded:
         return self.changed(variants={k: row.model_copy(update=changes) for k, row in rows})
 
     def only(self, names: Sequence[str]) -> Loaded:
-        """Restrict to some variants, with their editors, and tables without the other rows.
+        """Restrict to some variants, with their editors.
 
         Raises:
             InputError: no such variant.
@@ -252,15 +208,9 @@ class Loaded:
                     f"{suggest(name, list(m.variants))}"
                 )
         variants = {name: m.variants[name] for name in names}
-        tables = []
-        for table in m.tables:
-            rows = [row for row in table.rows if row in variants]
-            against = table.against if table.against in rows else None
-            if rows:
-                tables.append(table.model_copy(update={"rows": rows, "against": against}))
         used = {row.editor for row in variants.values()}
-        editors = {name: weights for name, weights in m.editors.items() if name in used}
-        return self.changed(variants=variants, tables=tables, editors=editors)
+        editors = {name: folder for name, folder in m.editors.items() if name in used}
+        return self.changed(variants=variants, editors=editors)
 
     def with_editors(self, folders: Sequence[str]) -> Loaded:
         """Replace editors by others of their kind; other variants are dropped.
@@ -278,7 +228,7 @@ class Loaded:
                 " kind; leave it out"
             )
         editors = {
-            name: Weights(folder=_from(Path.cwd(), given[guide]), scheduler="any")
+            name: _from(Path.cwd(), given[guide])
             for name, guide in guides.items()
             if guide in given
         }
@@ -286,21 +236,22 @@ class Loaded:
         return self.changed(editors={**m.editors, **editors}).only(kept)
 
     def quick(self) -> Loaded:
-        """Restrict to the first capture, edit and seed, and two variants: the baseline row of
-        the first table, and another row with the same editor."""
-        m, table = self.manifest, self.tables()[0]
-        against = table.against or table.rows[0]
-        editor = m.variants[against].editor
-        others = sorted(
-            (r for r in table.rows if r != against), key=lambda r: m.variants[r].editor != editor
+        """Restrict to the first capture, edit and seed, and two variants: the first one that warps
+        attention, and another one, with the same editor if there is one."""
+        m = self.manifest
+        first, *others = sorted(
+            m.variants, key=lambda name: m.variants[name].method != "attention_warping"
         )
-        kept = [against, *others[:1]]
+        editor = m.variants[first].editor
+        others.sort(key=lambda name: m.variants[name].editor != editor)
         name, capture = next(iter(m.captures.items()))
-        first = dict([next(iter(capture.edits.items()))])
-        return self.with_rows(seeds=self.seeds(m.variants[against])[:1]).only(kept).changed(
-            captures={name: capture.model_copy(update={"edits": first})}, geometry=0,
-            tables=[TablePart(title="Quick look", rows=kept, against=against)],
-        )  # fmt: skip
+        edits = dict([next(iter(capture.edits.items()))])
+        variants = {
+            name: row.model_copy(update={"seeds": self.seeds(row)[:1]})
+            for name, row in m.variants.items()
+        }
+        captures = {name: capture.model_copy(update={"edits": edits})}
+        return self.changed(variants=variants, captures=captures).only([first, *others[:1]])
 
 
 def _from(place: Path, editor: str) -> str:
@@ -376,26 +327,8 @@ def load_manifest(name_or_path: str, one: Mapping[str, Any] | None = None) -> Lo
     return loaded
 
 
-def in_folders(manifest: Manifest) -> dict[str, Weights]:
-    """Weights that are not bundled, by key."""
-    from attnwarp.editing.small import bundled
-    from attnwarp.encoders import BUNDLED
-
-    known = {*bundled(), *BUNDLED}
-    encoders = {f"encoders.{k}": getattr(manifest.encoders, k) for k in Encoders.model_fields}
-    named = {**{f"editors.{k}": w for k, w in manifest.editors.items()}, **encoders}
-    return {key: w for key, w in named.items() if w.folder not in known}
-
-
-def lacking(manifest: Manifest) -> list[str]:
-    """Keys of weights in folders without a probe value or a hash."""
-    weights = in_folders(manifest).items()
-    return [key for key, w in weights if w.probe is None and w.sha256 is None]
-
-
 def _check_names(path: Path, lines: dict[Place, int], manifest: Manifest) -> None:
-    """Refuse unknown names, settings that no method has, and edits without prompts that published
-    figures need."""
+    """Refuse unknown names, and settings that no method has."""
     from attnwarp.fit import FitSettings
     from attnwarp.methods import Budget
 
@@ -421,20 +354,6 @@ def _check_names(path: Path, lines: dict[Place, int], manifest: Manifest) -> Non
             Budget.from_dict(row.budget)
         except (TypeError, ValueError) as error:
             raise InputError(f"{path}: variants.{name}: {error}") from None
-    for number, table in enumerate(manifest.tables):
-        for name in [*table.rows, *([table.against] if table.against else [])]:
-            known(f"tables.{number}", name, list(manifest.variants))
-    if any(row.paper for row in manifest.variants.values()):
-        for name, capture in manifest.captures.items():
-            for title, edit in capture.edits.items():
-                place = ("captures", name, "edits", title)
-                for key in ("controlnet", "source", "target"):
-                    if getattr(edit, key) is None:
-                        raise InputError(
-                            f"{path}:{line_of(lines, place)}: {'.'.join(place)}.{key}: is missing,"
-                            " expected the words of this prompt, which figures beside the paper's"
-                            " need; where none was published, write your own"
-                        )
     try:
         FitSettings.from_dict(manifest.fit)
     except ValueError as error:

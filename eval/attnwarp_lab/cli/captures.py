@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,13 +13,7 @@ from attnwarp.cli.options import Marking, MaxSizeOption, option, options_of
 from attnwarp.cli.shell import fail
 from attnwarp.errors import InputError
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import (
-    TOO_LITTLE,
-    clear_errors,
-    resumable,
-    scheduler_lost,
-    whole_numbers,
-)
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable, whole_numbers
 
 ONE = "One capture"
 """Name of the help panel."""
@@ -89,7 +84,7 @@ class One:
         }  # fmt: skip
         return {
             "title": f"Methods on {self.name}", "captures": {self.name: capture},
-            "max_size": self.max_size, "geometry": 0,
+            "max_size": self.max_size,
         }  # fmt: skip
 
 
@@ -121,28 +116,14 @@ def captures(
         str | None, option("Only these seeds (comma-separated whole numbers).")
     ] = None,
     device: Annotated[
-        str,
-        option(
-            "cpu, cuda, or several such as cuda:0,cuda:1: one process each.", "DEVICE[,DEVICE...]"
-        ),
+        str, option("Where the networks run: cpu, cuda, or one of several, such as cuda:1.")
     ] = "cpu",
-    jobs: Annotated[
-        int | None, option("Processes; one a device if left out.", None, "--jobs", "-j", min=1)
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        option(
-            "A dask scheduler, whose workers see this folder and the manifest's.", "ADDRESS|FILE"
-        ),
-    ] = None,
     quick: Annotated[
         bool, option("One scene, one edit, one seed, two variants.", None, "--quick")
     ] = False,
     dry_run: Annotated[
         bool,
-        option(
-            "Check everything, tell hours, disk and memory, and run nothing.", None, "--dry-run"
-        ),
+        option("Check everything, count network rows, and run nothing.", None, "--dry-run"),
     ] = False,
     *,
     one: One,
@@ -154,15 +135,12 @@ def captures(
     Everything is checked before anything runs. Killed and started again, it goes on.
     """
     from attnwarp.devices import device_of
+    from attnwarp.reporting import Part
     from attnwarp_eval.study.store import Store
-    from attnwarp_lab.captures import cells
-    from attnwarp_lab.captures.check import check
-    from attnwarp_lab.captures.manifest import lacking, load_manifest
+    from attnwarp_lab.captures.cells import Run
+    from attnwarp_lab.captures.manifest import load_manifest
     from attnwarp_lab.captures.report import write_report
-    from attnwarp_lab.captures.seal import open_seal, write_seal
 
-    if scheduler is not None and jobs is not None:
-        raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
     if manifest is None and one.data is None:
         raise fail("name a manifest, such as paper, or one capture: --data DIR --instruction TEXT")
     drawn = whole_numbers(seeds, "--seeds")
@@ -172,51 +150,57 @@ def captures(
         loaded = loaded.only(variant) if variant else loaded
         loaded = loaded.with_rows(seeds=drawn) if drawn else loaded
         loaded = loaded.quick() if quick else loaded
-        devices = [part.strip() for part in device.split(",")]
-        for name in devices if scheduler is None else ():
-            device_of(name)
+        device_of(device)
         named = one.name if one.data else Path(str(manifest)).stem
         store = Store(out or Path("runs/captures") / named)
         store.refuse_strangers("manifest")
         report.log("checking captures and weights")
-        checked = check(loaded, store.root, devices[0] if scheduler is None else "cpu", report)
-        checked.refuse()
-        planned = cells.plan(loaded, checked, store.root, devices)
-        left = cells.todo(planned.cells, store)
-        for note in planned.notes:
+        run = Run(loaded, store.root, device, report)
+        cells, notes = run.plan()
+        for note in notes:
             report.log(note)
-        for name, (sha256, probe) in checked.weights.items():
-            report.log(f"{name}: probe {probe:.6g}, sha256 {sha256}")
-        if unknown := lacking(loaded.manifest):
-            report.log(
-                f"{', '.join(unknown)}: the manifest has no probe value, so another checkpoint of"
-                " the same shapes would pass too; whoever has the published weights writes the"
-                " values above into it, as `probe`"
-            )
-        done = len(planned.cells) - len(left)
-        report.log(f"{len(planned.cells)} cells, {done} done in {store.root}")
         if dry_run:
-            from attnwarp_lab.captures.estimate import estimate
-
-            for line in estimate(planned, left, devices, report):
-                typer.echo(line)
+            _count_rows(run, cells)
             return
+        records, failures = [], []
         with store.lock(), resumable(lambda: f"{len(store.done())} cells are kept"):
-            if broken := open_seal(store, planned.cells):
-                report.log(
-                    f"{len(broken)} sealed files are missing or changed and are made anew:"
-                    f" {', '.join(broken[:8])}{' ...' * (len(broken) > 8)}"
-                )
-            store.write_study(cells.expected(planned))
-            with scheduler_lost(scheduler, lambda: len(store.done())):
-                failures = cells.execute(
-                    planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
-                )
-            paths = [*write_report(planned, store), write_seal(store)]
+            about = loaded.manifest.model_dump(mode="json")
+            store.write_study({"manifest": about, "cells": [cell.id for cell in cells]})
+            for number, cell in enumerate(cells):
+                title = f"{cell.scene} / {cell.spec['edit']} / {cell.variant} / seed {cell.seed}"
+                report.step(number, len(cells), title)
+                record = store.whole(cell.id, dict)
+                if record is None:
+                    try:
+                        computed = run.compute(cell, Part(report, number, len(cells)))
+                    except Exception as error:  # the others are worth their hours
+                        failures.append(f"{title}: {type(error).__name__}: {error}")
+                        continue
+                    store.write({"id": cell.id, "spec": cell.spec, **computed})
+                    record = store.read(cell.id)
+                records.append((cell, record))
+            report.step(len(cells), len(cells), "done")
+            paths = write_report(run, records, len(failures), notes)
         for path in paths:
             typer.echo(path)
     if failures:
-        listed = "; ".join(f"{f.title}: {f.error}" for f in failures)
         raise fail(
-            f"{len(failures)} cells failed; the same command tries them again: {listed}", TOO_LITTLE
+            f"{len(failures)} cells failed; the same command tries them again:"
+            f" {'; '.join(failures)}",
+            TOO_LITTLE,
         )
+
+
+def _count_rows(run: Any, cells: Sequence[Any]) -> None:
+    """Print the cells and network rows of each variant, and of all."""
+    total, unknown = 0, 0
+    by_variant: dict[str, list[int | None]] = {}
+    for cell in cells:
+        by_variant.setdefault(" = ".join(cell.labels), []).append(run.rows(cell))
+    for variant, counts in by_variant.items():
+        known = [rows for rows in counts if rows is not None]
+        total, unknown = total + sum(known), unknown + len(counts) - len(known)
+        rows = f"{sum(known):,} network rows" if known else "rows not told by its method"
+        typer.echo(f"{variant}: {len(counts)} cells, {rows}")
+    lacking = f", without those of {unknown} cells whose method does not tell them"
+    typer.echo(f"all: {len(cells)} cells, {total:,} network rows{lacking if unknown else ''}")

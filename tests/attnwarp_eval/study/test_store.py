@@ -251,7 +251,7 @@ def test_a_run_on_captures_is_told_as_one_where_a_study_is_expected(tmp_path, mo
     before = (tmp_path / "study.json").read_bytes()
     done = CliRunner().invoke(app, [*command, "."])
     assert done.exit_code == 2
-    assert "is a run on captures (attnwarp-eval captures, which writes its tables)" in done.stderr
+    assert "is a run on captures (attnwarp-eval captures, which writes its table)" in done.stderr
     assert (tmp_path / "study.json").read_bytes() == before
     Store(tmp_path).write_study({"study": {}, "cells": []})
     with pytest.raises(StoreError, match="is a run of a study"):
