@@ -45,35 +45,23 @@ class Written:
     colors: dict[str, tuple[int, int, int]]
 
 
-def write_run(
-    folder,
-    views=2,
-    methods=METHODS,
-    seeds=(1, 2),
-    more=MappingProxyType({}),
-    steps=1,
-    instruction="paint it",
-    name="run",
-    encoders=MappingProxyType({}),
-):
+def write_run(folder, views=2, seeds=(1, 2), more=MappingProxyType({})):
     """A run of two edits and so many seeds; every picture of a method has its colour.
 
-    ``more`` has further pictures of a method: their colours by what they show. ``steps`` are the
-    first method's, ``name`` is that of the run's folder, ``encoders`` are of the figures alone.
+    ``more`` has further pictures of a method: their colours by what they show.
     """
-    edits = [{**e, "instruction": f"{instruction} {e['name']}"} for e in SCENE["edits"]]
+    edits = [{**e, "instruction": f"paint it {e['name']}"} for e in SCENE["edits"]]
     (folder / "ball.yaml").write_text(yaml.safe_dump({**SCENE, "edits": edits}))
     names = ["yaw015", "yaw030", "yaw060", "yaw090"][:views]
     study = {
         "name": "people", "size": 32, "scenes": ["ball.yaml"], "seeds": list(seeds), "spp": 4,
-        "variants": {method: {"method": "by_view", "options": {"steps": k + steps}}
-                     for k, method in enumerate(METHODS) if method in methods},
-        "probes": {"editing": list(methods)},
-        "pictures": {"variants": list(methods), "views": names},
-        **({"encoders": dict(encoders)} if encoders else {}),
+        "variants": {method: {"method": "by_view", "options": {"steps": k + 1}}
+                     for k, method in enumerate(METHODS)},
+        "probes": {"editing": list(METHODS)},
+        "pictures": {"variants": list(METHODS), "views": names},
     }  # fmt: skip
     (folder / "people.yaml").write_text(yaml.safe_dump(study))
-    store = Store(folder / name)
+    store = Store(folder / "run")
     planned = plan(load_study(str(folder / "people.yaml")), store)
     store.write_study(expected(planned))
     colors = {name: (60 * k + 40, 200 - 60 * k, 90) for k, name in enumerate(METHODS)}

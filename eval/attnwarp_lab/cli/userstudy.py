@@ -19,12 +19,11 @@ app = typer.Typer(
 
 @app.command()
 def build(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that edited scenes.")
-    ],
+    run: Annotated[Path, typer.Argument(help="The folder of a run that edited scenes.")],
     out: Annotated[Path, option("The page.")] = Path("userstudy.html"),
-    methods: Annotated[
-        str | None, option("Only these variants (comma-separated); else all with pictures.")
+    method: Annotated[
+        list[str] | None,
+        option("Only this variant; may be repeated. All with pictures if left out.", "NAME"),
     ] = None,
     questions: Annotated[
         str | None, option("Of instruction, consistency, quality (comma-separated); else all.")
@@ -35,7 +34,7 @@ def build(
     seed: Annotated[int, option("Of what is drawn.", min=0)] = 0,
     title: Annotated[str, option("Of the page.")] = "Which edit do you prefer?",
 ) -> None:
-    """Make one self-contained page of two-way choices between the methods of runs.
+    """Make one self-contained page of two-way choices between the methods of a run.
 
     It works offline, on a phone too. Answers are saved as a JSON file; nothing is sent.
     """
@@ -52,9 +51,8 @@ def build(
                     f"--questions: got {questions!r}, expected different ones of"
                     f" {', '.join(QUESTIONS)}{suggest(name, list(QUESTIONS))}"
                 )
-        for run in runs:
-            check_not_of_run(out, run)
-        items = read_items(runs, names(methods))
+        check_not_of_run(out, run)
+        items = read_items(run, method)
         text = build_page(items, Design(asked, plans, choices, checks, seed), title)
         write_atomic(out, text.encode())
     compared = dict.fromkeys(name for item in items for name in item.methods)
@@ -69,7 +67,7 @@ def score(
     ],
     out: Annotated[Path | None, option("Folder for preferences.json, .md and .html.")] = None,
 ) -> None:
-    """Preferences with intervals, agreement between people, and who failed attention checks."""
+    """How often people chose each method, with intervals, and who failed attention checks."""
     import json
 
     from rich.console import Console

@@ -38,11 +38,6 @@ class Answer(BaseModel):
         """True if it is an attention check."""
         return SCRAMBLED in (self.left, self.right)
 
-    @property
-    def comparison(self) -> tuple[object, ...]:
-        """Key of the comparison and its question, independent of sides."""
-        return (self.scene, self.edit, self.seed, self.question, *sorted(self.pair))
-
 
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -64,7 +59,6 @@ class Person:
         name: random name from the page.
         path: path of the file.
         study, title: study and title of the page.
-        planned: number of choices planned for the person.
         choices: choices made, without attention checks.
         checks: attention checks.
     """
@@ -73,7 +67,6 @@ class Person:
     path: Path
     study: str
     title: str
-    planned: int
     choices: tuple[Answer, ...]
     checks: tuple[Answer, ...]
 
@@ -103,20 +96,10 @@ def read_answers(paths: Sequence[Path]) -> tuple[list[Person], list[str]]:
             )
         other = people.get(person.name)
         if other is not None:
-            short, long = sorted((other, person), key=_length)
-            made = (*long.choices, *long.checks)
-            if not set((*short.choices, *short.checks)) <= set(made):
-                raise InputError(
-                    f"{path}: the same person as in {other.path}, with other answers; delete one"
-                )
-            notes.append(f"{short.path}: left out, as {long.path} has the same person's answers")
-            person = long
+            short, person = sorted((other, person), key=lambda one: len(one.choices))
+            notes.append(f"{short.path}: left out, as {person.path} has the same person's answers")
         people[person.name] = person
     return list(people.values()), notes
-
-
-def _length(person: Person) -> int:
-    return len(person.choices) + len(person.checks)
 
 
 def _read(path: Path) -> Person:
@@ -139,7 +122,6 @@ def _read(path: Path) -> Person:
         path,
         read.study,
         read.title,
-        read.planned,
         tuple(answer for answer in read.choices if not answer.is_check),
         tuple(answer for answer in read.choices if answer.is_check),
     )

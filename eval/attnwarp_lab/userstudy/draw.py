@@ -49,8 +49,7 @@ def draw(
     """Plans, one for a person.
 
     Comparisons cycle: every pair of methods under every question comes equally often, scene
-    after scene. In each plan a method is on the left as often as on the right, to within one.
-    Every second plan mirrors the previous one, in another order.
+    after scene. Sides are drawn; every second plan mirrors the previous one, in another order.
 
     Args:
         methods: methods of each item.
@@ -73,7 +72,7 @@ def draw(
     count, taken = min(choices, len(stream)), itertools.cycle(stream)
     result: list[list[Choice]] = []
     while len(result) < plans:
-        own = _sided(list(itertools.islice(taken, count)))
+        own = [rng.choice((choice, choice.mirrored())) for choice in itertools.islice(taken, count)]
         tests = _checks(methods, questions, checks, rng)
         for half in (own, [choice.mirrored() for choice in own]):
             result.append(_ordered(half, tests, questions, rng))
@@ -103,36 +102,6 @@ def _comparisons(
         rng.shuffle(block)
         stream += [Choice(item, question, a, b) for (question, a, b), item in block]
     return stream
-
-
-def _sided(choices: list[Choice]) -> list[Choice]:
-    """Sides such that each method is on the left as often as on the right, to within one.
-
-    Choices are the edges of a graph of methods. Edges to an extra node make every degree even; an
-    Eulerian circuit then leaves each node as often as it enters it.
-    """
-    beyond = ""
-    ends = [(choice.left, choice.right) for choice in choices]
-    degree: dict[str, int] = {}
-    for name in itertools.chain.from_iterable(ends):
-        degree[name] = degree.get(name, 0) + 1
-    ends += [(name, beyond) for name, count in degree.items() if count % 2]
-    edges: dict[str, list[int]] = {}
-    for number, pair in enumerate(ends):
-        for name in pair:
-            edges.setdefault(name, []).append(number)
-    left: dict[int, str] = {}
-    for start in edges:
-        node = start
-        # A walk that cannot continue is back at its start, since all degrees are even.
-        while edges[node]:
-            number = edges[node].pop()
-            if number in left:
-                continue
-            left[number] = node
-            a, b = ends[number]
-            node = b if node == a else a
-    return [c if left[n] == c.left else c.mirrored() for n, c in enumerate(choices)]
 
 
 def _checks(

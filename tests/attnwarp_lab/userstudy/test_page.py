@@ -83,7 +83,7 @@ def test_equal_arguments_give_equal_bytes_and_another_seed_another_study(run, tm
 
 
 def test_methods_and_questions_can_be_chosen(run, tmp_path):
-    done = build(run.root, "--out", tmp_path / "a", "--methods", "alone,third", "--questions", "quality",
+    done = build(run.root, "--out", tmp_path / "a", "--method", "alone", "--method", "third", "--questions", "quality",
                  "--choices", 3, "--checks", 0, "--plans", 4)  # fmt: skip
     assert done.exit_code == 0, done.output
     _, study = read(tmp_path / "a")
@@ -129,8 +129,8 @@ def test_scrambling_moves_the_parts_and_keeps_them():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--methods", "alone"], "no edited scene has pictures of two methods"),
-        (["--methods", "alone,magic"], "--methods: got 'magic'"),
+        (["--method", "alone"], "no edited scene has pictures of two methods"),
+        (["--method", "magic"], "--method: got 'magic'"),
         (["--questions", "beauty"], "--questions: got 'beauty'"),
         (["--questions", "quality,quality"], "expected different ones"),
     ],
@@ -139,16 +139,6 @@ def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
     done = build(run.root, "--out", tmp_path / "a", *arguments)
     assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
     assert not (tmp_path / "a").exists()
-
-
-def test_a_method_whose_name_has_a_comma_can_be_chosen(tmp_path):
-    run = write_run(tmp_path)
-    path = run.root / "study.json"
-    Store(run.root).write_study(json.loads(path.read_text().replace('"warped"', '"alone, warped"')))
-    done = build(run.root, "--out", tmp_path / "a", "--methods", "third,alone, warped")
-    assert done.exit_code == 0, done.output
-    sides = [set(item["sides"]) - {SCRAMBLED} for item in read(tmp_path / "a")[1]["items"]]
-    assert sides == [{"third", "alone, warped"}] * 4
 
 
 def test_two_names_of_the_same_settings_are_both_on_the_page(tmp_path):
@@ -165,26 +155,6 @@ def test_two_names_of_the_same_settings_are_both_on_the_page(tmp_path):
     assert done.exit_code == 0, done.output
     for item in read(tmp_path / "a")[1]["items"]:
         assert set(names) <= set(item["sides"])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"steps": 50}, "'alone' has other settings than in {first}; give the variant another"),
-        ({"instruction": "paint it bright"}, "instruction than in the runs before"),
-        ({"methods": ["alone", "warped"]}, None),  # the same cells
-        ({"encoders": {"clip": "clip-parts"}}, None),  # the same pictures, measured otherwise
-    ],
-)
-def test_one_name_is_one_method_in_all_runs(tmp_path, changes, message):
-    first, other = write_run(tmp_path), write_run(tmp_path, **changes, name="other")
-    done = build(first.root, other.root, "--out", tmp_path / "a")
-    if message is None:
-        assert done.exit_code == 0, done.output
-        return
-    assert done.exit_code == 2 and done.stderr.count("\n") == 1
-    assert done.stderr.startswith(f"attnwarp-eval: {other.root}: ")
-    assert message.format(first=first.root) in done.stderr
 
 
 def pixels_of(address):
@@ -212,7 +182,7 @@ def captured(folder, views=20, size=320):
             picture = Image.new("RGB", (size, size // 2), color)
             picture.save(folder / part / f"view-{view:04d}.png")
     cells = [
-        {"id": str(k), "kind": "edit", "scene": "garden", "edit": "snow", "seed": 0,
+        {"id": str(k), "scene": "garden", "edit": "snow", "seed": 0,
          "variants": [name], "folder": f"made/{k}"}
         for k, name in enumerate(colors)
     ]  # fmt: skip
