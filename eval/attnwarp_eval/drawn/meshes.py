@@ -19,9 +19,6 @@ from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh
 
 Array = npt.NDArray[np.float64]
 
-UPRIGHT_Z = (".stl", ".off")
-"""Formats of machines and of geometry, which have z up; the others' files have y up."""
-
 LONGEST_EDGE = 0.03
 """Edges of things, in units of the scene: textures have their colours at vertices."""
 
@@ -46,11 +43,11 @@ class MeshDraft(SceneDraft):
 
     Attributes:
         meshes: files of :func:`mesh_files`.
-        up: upright axis of all files; by default that of their format.
+        up: upright axis of all files.
     """
 
     meshes: list[Path] = field(default_factory=list)
-    up: Literal["y", "z"] | None = None
+    up: Literal["y", "z"] = "y"
     word: ClassVar[str] = "mesh"
 
     def stream(self, what: str) -> np.random.Generator:
@@ -78,13 +75,12 @@ class MeshDraft(SceneDraft):
             self.things.append(self._thing(k, path, look, size, round(360 * own.random(), 1)))
 
     def _thing(self, number: int, path: Path, look: Look, size: float, yaw: float) -> Thing:
-        up = self.up or ("z" if path.suffix.lower() in UPRIGHT_Z else "y")
         try:
             mesh = read_mesh(path)
         except ValueError as error:
             raise InputError(str(error)) from error
         points = mesh.vertices
-        if up == "y":
+        if self.up == "y":
             points = points[:, [0, 2, 1]] * np.array([1, -1, 1])
         a = math.radians(yaw)
         turn = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
@@ -95,7 +91,7 @@ class MeshDraft(SceneDraft):
         file = f"meshes/{path.name}"
         self.files[file] = path
         shape: dict[str, Any] = {
-            "type": "mesh", "file": file, "up": up, "yaw": yaw, "scale": scale,
+            "type": "mesh", "file": file, "up": self.up, "yaw": yaw, "scale": scale,
             "position": [float(x) for x in offset], "longest_edge": LONGEST_EDGE,
         }  # fmt: skip
         # A readable word, and a unique name for each thing.

@@ -137,9 +137,9 @@ class MeshScenes(_Scenes):
     """Other people's meshes on drawn ground: ``scenes: {meshes: FOLDER, n: 12, seed: 7}``.
 
     Attributes:
-        meshes: folder of OBJ, PLY, STL, GLB or OFF files.
+        meshes: folder of GLB or PLY files.
         n: number of scenes, numbered from 0.
-        up: upright axis of all files; by default that of their format (z for STL and OFF, else y).
+        up: upright axis of all files; y if left out.
     """
 
     meshes: str
@@ -162,7 +162,9 @@ class MeshScenes(_Scenes):
     def scene(self, number: int) -> Drawn:
         """Draw one scene."""
         places = self.places(number)
-        return MeshDraft(number, self.seed, places, meshes=self._paths, up=self.up).finished()
+        return MeshDraft(
+            number, self.seed, places, meshes=self._paths, up=self.up or "y"
+        ).finished()
 
 
 Population = DrawnScenes | MeshScenes

@@ -6,6 +6,7 @@ import hashlib
 
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
@@ -94,8 +95,9 @@ def test_a_file_that_was_changed_by_hand_is_not_drawn_over(tmp_path):
     meshes, out = tmp_path / "meshes", tmp_path / "out"
     meshes.mkdir()
     for name, height in (("a", 1), ("b", 2)):
-        text = f"v 0 0 0\nv 1 0 0\nv 0 {height} 0\nv 0 0 1\nf 1 2 3\nf 1 3 4\nf 1 2 4\nf 2 3 4\n"
-        (meshes / f"{name}.obj").write_text(text)
+        corners = [(0, 0, 0), (1, 0, 0), (0, height, 0), (0, 0, 1)]
+        faces = [(0, 1, 2), (0, 2, 3), (0, 1, 3), (1, 2, 3)]
+        trimesh.Trimesh(corners, faces, process=False).export(meshes / f"{name}.ply")
     command = ["scenes", "draw", "1", "--seed", "3", "--out", str(out), "--meshes", str(meshes)]
     assert CliRunner().invoke(app, command).exit_code == 0
     written = {path: path.read_bytes() for path in out.rglob("*.*")}

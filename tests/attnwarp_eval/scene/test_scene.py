@@ -215,23 +215,25 @@ def test_a_scene_that_is_not_there_is_told_with_what_is(tmp_path):
 
 OWN = SMALL.replace(
     "shape:\n      type: sphere\n      center: [0, 0, 0.5]\n      radius: 0.5\n",
-    "shape: {type: mesh, file: scans/ball.obj, scale: 0.5, position: [0, 0, 0.5], up: y}\n",
+    "shape: {type: mesh, file: scans/ball.ply, scale: 0.5, position: [0, 0, 0.5], up: y}\n",
 )
 
 
-def octahedron(extra=""):
+def octahedron(comment=""):
     corners = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-    faces = ["1 3 5", "3 2 5", "2 4 5", "4 1 5", "3 1 6", "2 3 6", "4 2 6", "1 4 6"]
+    faces = ["0 2 4", "2 1 4", "1 3 4", "3 0 4", "2 0 5", "1 2 5", "3 1 5", "0 3 5"]
+    head = "".join(f"property float {axis}\n" for axis in "xyz")
     return (
-        "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
-        + "".join(f"f {face}\n" for face in faces)
-        + extra
+        f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 6\n{head}"
+        "element face 8\nproperty list uchar int vertex_indices\nend_header\n"
+        + "".join(f"{x} {y} {z}\n" for x, y, z in corners)
+        + "".join(f"3 {face}\n" for face in faces)
     )
 
 
 def test_shapes_are_built_once_for_a_scene_and_its_other_sizes(tmp_path, monkeypatch):
     (tmp_path / "scans").mkdir()
-    (tmp_path / "scans" / "ball.obj").write_text(octahedron())
+    (tmp_path / "scans" / "ball.ply").write_text(octahedron())
     read = []
     monkeypatch.setattr(
         "attnwarp_eval.scene.scene.read_mesh", lambda path: read.append(path) or read_mesh(path)
@@ -245,7 +247,7 @@ def test_shapes_are_built_once_for_a_scene_and_its_other_sizes(tmp_path, monkeyp
 
 def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_content(tmp_path):
     (tmp_path / "scans").mkdir()
-    mesh = tmp_path / "scans" / "ball.obj"
+    mesh = tmp_path / "scans" / "ball.ply"
     mesh.write_text(octahedron())
     path = write(tmp_path, OWN)
     first = load_scene(path)
@@ -254,7 +256,7 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
     low, high = first.shapes()[1].bounds()
     assert np.allclose([low, high], [[-0.5, -0.5, 0], [0.5, 0.5, 1.0]], atol=1e-7)
     before = first.content_hash
-    mesh.write_text(octahedron("# another byte\n"))
+    mesh.write_text(octahedron("another byte"))
     assert load_scene(path).content_hash != before
 
 
@@ -262,9 +264,9 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
     ("old", "new", "says"),
     [
         (
-            "scans/ball.obj",
-            "scans/bal.obj",
-            r"there is no file .*scans/bal.obj; did you mean 'ball.obj'\?; the path counts",
+            "scans/ball.ply",
+            "scans/bal.ply",
+            r"there is no file .*scans/bal.ply; did you mean 'ball.ply'\?; the path counts",
         ),
         (
             "position: [0, 0, 0.5]",
@@ -275,7 +277,7 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
 )
 def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new, says):
     (tmp_path / "scans").mkdir()
-    (tmp_path / "scans" / "ball.obj").write_text(octahedron())
+    (tmp_path / "scans" / "ball.ply").write_text(octahedron())
     with pytest.raises(SceneError, match=says) as caught:
         load_scene(write(tmp_path, OWN.replace(old, new)))
     assert caught.value.line is not None

@@ -46,7 +46,7 @@ name: own
 title: A tetrahedron
 objects:
   - name: thing
-    shape: {type: mesh, file: ../meshes/thing.off}
+    shape: {type: mesh, file: ../meshes/thing.ply}
     texture: {type: checker, colors: ['#7a3b8f', '#e6d3ea'], size: 0.2, variation: 0.2}
 lights: [{type: sky, horizon: '#cfdcea', zenith: '#6f9fd8', radiance: 1.0}]
 cameras:
@@ -56,7 +56,25 @@ cameras:
   source: {yaw: 0, height: 1.5}
   targets: [{yaw: 30, height: 1.5}]
 """
-TETRAHEDRON = "OFF\n4 4 6\n1 1 1\n-1 -1 1\n-1 1 -1\n1 -1 -1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+TETRAHEDRON = """\
+ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 4
+property list uchar int vertex_indices
+end_header
+1 1 1
+-1 -1 1
+-1 1 -1
+1 -1 -1
+3 0 2 1
+3 0 1 3
+3 0 3 2
+3 1 2 3
+"""
 
 # What each worker process runs before anything else.
 NO_SHARED_DISK = """
@@ -78,7 +96,7 @@ def home(tmp_path):
     (home / "meshes").mkdir()
     (home / "study.yaml").write_text(yaml.safe_dump(STUDY))
     (home / "mine" / "own.yaml").write_text(OWN)
-    (home / "meshes" / "thing.off").write_text(TETRAHEDRON)
+    (home / "meshes" / "thing.ply").write_text(TETRAHEDRON)
     return home
 
 

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -101,9 +102,11 @@ def test_meshes_of_a_folder_stand_upright_on_drawn_ground(tmp_path, monkeypatch)
     models = tmp_path / "models"
     models.mkdir()
     box = trimesh.creation.box((2.0, 6.0, 2.0)).apply_translation((5, 40, -3))
-    box.export(models / "tower.obj")  # y is up
-    trimesh.creation.cone(radius=0.5, height=3.0).export(models / "cone.stl")  # z is up
-    (models / "._tower.obj").write_bytes(b"\0\5\x16\7")  # macOS' own
+    box.export(models / "tower.glb")
+    cone = trimesh.creation.cone(radius=0.5, height=3.0)
+    cone.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))  # y is up
+    cone.export(models / "cone.ply")
+    (models / "._tower.glb").write_bytes(b"\0\5\x16\7")  # macOS' own
     path = tmp_path / "mine.yaml"
     path.write_text(STUDY.replace("{drawn: 3, generator: 1,", "{meshes: models, n: 3,"))
     study = load_study(str(path))

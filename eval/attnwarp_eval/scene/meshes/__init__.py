@@ -1,8 +1,7 @@
 """Triangle meshes from files: one reader for each format, and polygons cut into triangles.
 
-The package has its own readers so that damaged files are refused: Open3D aborts the process on some
-damaged .off files and drops the polygons of an .obj, and trimesh accepts a face line with fewer
-corners than it announces.
+The package has its own readers so that damaged files are refused: trimesh accepts a face line with
+fewer corners than it announces.
 """
 
 from attnwarp_eval.scene.meshes.read import (

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import numpy.typing as npt
-
-from attnwarp.numba_cache import CACHE
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MOST_CORNERS = 5000
-"""Concave polygons with more corners are refused: ear clipping takes the square of their number."""
+
+NONE = -1
+"""Corner of a triangle that is left out."""
 
 
 def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indices, Indices]:
     """Triangulate polygons, in the polygons' order and with their winding.
 
-    A convex polygon becomes a fan about its first corner; other polygons are ear-clipped (Meisters
-    1975) in the plane of its mean normal (Newell's method).
+    A convex polygon becomes a fan about its first corner; another one is cut by mapbox-earcut in
+    the plane of its mean normal (Newell's method).
 
     Args:
         vertices: (V, 3).
@@ -27,11 +25,8 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
         sizes: (P,) corners of each polygon, at least 3.
 
     Returns:
-        faces: (F, 3); a polygon of n corners gives n - 2.
+        faces: (F, 3); a polygon of n corners gives n - 2, or fewer if some lie on a straight line.
         crossed: (Q,) indices of the polygons that cross themselves; they give no triangles.
-
-    Raises:
-        ValueError: a concave polygon has too many corners.
 
     Example:
         >>> import numpy as np
@@ -60,22 +55,13 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
         # A polygon with zero net turning, such as a bow tie, has no normal but triangles with area.
         whole = np.linalg.norm(normal, axis=-1) >= 1e-9 * area
         for k in np.flatnonzero(~(_convex(points, normal) & whole)).tolist():
-            if size > MOST_CORNERS:
-                raise ValueError(
-                    f"polygon {group[k]} is concave and has {size} corners, more than"
-                    f" {MOST_CORNERS}; split it"
-                )
-            ears = _ears(_flat(points[k], normal[k])) if whole[k] else ()
-            if len(ears):
-                faces[row[group[k]] + np.arange(size - 2)] = index[k][ears]
-            else:
+            ears = _ears(_flat(points[k], normal[k])) if whole[k] else np.empty((0, 3), np.int64)
+            own = faces[row[group[k]] : row[group[k] + 1]]
+            own[:] = NONE
+            own[: len(ears)] = index[k][ears]
+            if not len(ears):
                 crossed.append(int(group[k]))
-    if crossed:
-        keep = np.ones(len(faces), dtype=bool)
-        for k in crossed:
-            keep[row[k] : row[k + 1]] = False
-        faces = faces[keep]
-    return faces, np.array(sorted(crossed), np.int64)
+    return faces[(faces != NONE).all(axis=1)], np.array(sorted(crossed), np.int64)
 
 
 def _newell(points: Array) -> Array:
@@ -106,67 +92,21 @@ def _flat(points: Array, normal: Array) -> Array:
     return np.ascontiguousarray(flat / max(float(flat.max()), 1e-300))
 
 
-@numba.njit(cache=CACHE, nogil=True)
-def _area(points: Array, a: int, b: int, c: int) -> float:
-    return (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1]) - (
-        points[c, 0] - points[a, 0]
-    ) * (points[b, 1] - points[a, 1])
-
-
-@numba.njit(cache=CACHE, nogil=True)
 def _ears(points: Array) -> Indices:
-    """(n - 2, 3) triangles of a counterclockwise polygon; (0, 3) where no ear can be cut."""
-    n = len(points)
-    after, before = np.empty(n, np.int64), np.empty(n, np.int64)
-    for k in range(n):
-        after[k], before[k] = (k + 1) % n, (k - 1) % n
-    out = np.empty((n - 2, 3), np.int64)
-    count, here, left = 0, 0, n
-    while left > 3:
-        cut = -1
-        # Ears with an area first, so that a collinear corner becomes a corner of such an ear.
-        for flat in (False, True):
-            k = here
-            for _ in range(left):
-                a, c = before[k], after[k]
-                area = _area(points, a, k, c)
-                if (area > 1e-14 and not flat) or (flat and abs(area) <= 1e-14):
-                    free = True
-                    j = after[c]
-                    while j != a:
-                        p = points[j]
-                        # A bridge to a hole visits its ends twice; these do not block an ear.
-                        same = (
-                            (p[0] == points[a, 0] and p[1] == points[a, 1])
-                            or (p[0] == points[k, 0] and p[1] == points[k, 1])
-                            or (p[0] == points[c, 0] and p[1] == points[c, 1])
-                        )
-                        if (
-                            not flat
-                            and not same
-                            and _area(points, a, k, j) >= 0
-                            and _area(points, k, c, j) >= 0
-                            and _area(points, c, a, j) >= 0
-                        ):
-                            free = False
-                            break
-                        j = after[j]
-                    if free:
-                        cut = k
-                        break
-                k = after[k]
-            if cut >= 0:
-                break
-        if cut < 0:
-            return np.empty((0, 3), np.int64)
-        a, c = before[cut], after[cut]
-        out[count, 0], out[count, 1], out[count, 2] = a, cut, c
-        count += 1
-        after[a], before[c] = c, a
-        here = c
-        left -= 1
-    a, c = before[here], after[here]
-    if _area(points, a, here, c) < -1e-14:
-        return np.empty((0, 3), np.int64)
-    out[count, 0], out[count, 1], out[count, 2] = a, here, c
-    return out
+    """(T, 3) triangles of a counterclockwise polygon; (0, 3) if their area is another than the
+    polygon's, which crosses itself then.
+    """
+    from mapbox_earcut import triangulate_float64
+
+    ends = np.array([len(points)], np.uint32)
+    ears = triangulate_float64(points, ends).astype(np.int64).reshape(-1, 3)
+    parts = np.abs(_twice_areas(points[ears])).sum()
+    whole = _twice_areas(points[None])[0]
+    return ears if abs(parts - whole) <= 1e-9 * whole else ears[:0]
+
+
+def _twice_areas(outlines: Array) -> Array:
+    """(G,) twice the signed areas of (G, n, 2) outlines, by the shoelace formula."""
+    x, y = np.moveaxis(outlines, -1, 0)
+    areas: Array = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+    return areas

@@ -12,26 +12,17 @@ import numpy as np
 
 from attnwarp_eval.scene.base import FARTHEST
 from attnwarp_eval.scene.meshes.glb import read_glb
-from attnwarp_eval.scene.meshes.obj import read_obj
-from attnwarp_eval.scene.meshes.off import read_off
 from attnwarp_eval.scene.meshes.ply import read_ply
 from attnwarp_eval.scene.meshes.polygons import triangulate
-from attnwarp_eval.scene.meshes.stl import read_stl
 from attnwarp_eval.scene.meshes.surface import Surface
 from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 
-READER_PROTOCOL = 2
+READER_PROTOCOL = 3
 """Version; raised when the same file would give other triangles or colours; part of the hash of
 scenes with mesh files."""
 
 # No .gltf: it keeps its vertices in another file, which a hash of the .gltf would miss.
-READERS = {
-    ".ply": read_ply,
-    ".obj": read_obj,
-    ".glb": read_glb,
-    ".stl": read_stl,
-    ".off": read_off,
-}
+READERS = {".ply": read_ply, ".glb": read_glb}
 MESH_SUFFIXES = tuple(READERS)
 
 
@@ -51,7 +42,6 @@ class MeshFile:
         flat: number of triangles dropped because they have no area.
         unused: number of vertices that no polygon uses.
         ignored: unused contents of the file, in words.
-        cut_off: reason why polygons may be missing at the file's end, or None.
         inside_out: whether the faces of a closed surface look inward.
     """
 
@@ -61,7 +51,6 @@ class MeshFile:
     flat: int
     unused: int
     ignored: tuple[str, ...]
-    cut_off: str | None
     inside_out: bool
 
     def __str__(self) -> str:
@@ -78,13 +67,12 @@ class MeshFile:
             f"{self.polygons} polygons in, {len(self.mesh.faces)} triangles out"
             + (f"; left out: {', '.join(left_out)}" if left_out else "")
             + (f"; not used: {', '.join(self.ignored)}" if self.ignored else "")
-            + (f"; {self.cut_off}, so that its end may be missing" if self.cut_off else "")
             + (f"; {INSIDE_OUT}" if self.inside_out else "")
         )
 
 
 def read_mesh(path: Path) -> Mesh:
-    """A triangle mesh from a file (.ply, .obj, .glb, .stl, .off), all its parts joined.
+    """A triangle mesh from a file (.ply, .glb), all its parts joined.
 
     Vertex colours, if present, become the tint (taken as sRGB, but linear in .glb, as
     that format defines). Dropped parts are reported by a :class:`~attnwarp_eval.scene.shapes
@@ -102,7 +90,8 @@ def read_mesh_file(path: Path) -> MeshFile:
     if reader is None:
         raise ValueError(
             f"{path}: mesh format {path.suffix!r} is not read; use one of"
-            f" {', '.join(MESH_SUFFIXES)}"
+            f" {', '.join(MESH_SUFFIXES)}; trimesh writes one:"
+            f" trimesh.load({path.name!r}, force='mesh').export({path.stem + '.glb'!r})"
         )
     try:
         data = path.read_bytes()
@@ -115,14 +104,7 @@ def read_mesh_file(path: Path) -> MeshFile:
             _recent.pop(next(iter(_recent)))
         _recent[key] = result
     result = _recent[key]
-    if (
-        result.crossed
-        or result.flat
-        or result.unused
-        or result.ignored
-        or result.cut_off
-        or result.inside_out
-    ):
+    if result.crossed or result.flat or result.unused or result.ignored or result.inside_out:
         warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
     return result
 
@@ -143,27 +125,22 @@ def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFi
         outside = (surface.corners < 0) | (surface.corners >= len(surface.vertices))
         if outside.any():
             raise ValueError(
-                f"a face names vertex {int(surface.corners[outside][0]) + surface.first}, but"
+                f"a face names vertex {int(surface.corners[outside][0])}, but"
                 f" there are {len(surface.vertices)}"
             )
         named = np.zeros(len(surface.vertices), dtype=bool)
         named[surface.corners] = True
         bad = np.flatnonzero(named & ~np.isfinite(surface.vertices).all(axis=1))
         if bad.size:
-            raise ValueError(f"vertex {int(bad[0]) + surface.first} is not finite")
+            raise ValueError(f"vertex {int(bad[0])} is not finite")
         reach = np.abs(surface.vertices[named]).max(axis=1)
         if reach.max() > FARTHEST:
-            farthest = int(np.flatnonzero(named)[reach.argmax()]) + surface.first
+            farthest = int(np.flatnonzero(named)[reach.argmax()])
             raise ValueError(
                 f"vertex {farthest} lies {reach.max():.3g} from the origin, expected at most"
                 f" {FARTHEST:g}"
             )
         unused = int((~named).sum())
-        if surface.cut_off and unused:
-            raise ValueError(
-                f"{surface.cut_off}, and {unused} of {len(named)} vertices belong to no face, so"
-                " that its end seems to be missing"
-            )
         faces, crossed = triangulate(surface.vertices, surface.corners, surface.sizes)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; repair or export the file again") from error
@@ -179,7 +156,6 @@ def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFi
         len(faces) - len(mesh.faces),
         unused,
         surface.ignored,
-        surface.cut_off,
         _inside_out(mesh),
     )
     for array in (mesh.vertices, mesh.faces):
