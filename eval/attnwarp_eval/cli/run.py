@@ -386,7 +386,7 @@ def verdicts(
             typer.echo(path)
     if not write:
         typer.echo(markdown_table(all_studies.table(judged, folder)))
-    if not any(each.judged for each in judged):
+    if not any(each.comparison for each in judged):
         raise fail(
             f"{folder}: holds no raw results of a study that judges a claim; write them with"
             " attnwarp-eval report RUN --raw FOLDER",

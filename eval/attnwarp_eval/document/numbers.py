@@ -49,7 +49,7 @@ def pooled(error: Interval, scenes: int | None = None) -> str:
     text = decibels(error.mean)
     if error.bounded:
         text += f" [{decibels(error.high)}, {decibels(error.low)}]"
-    return text + _note(error, scenes)
+    return text + note(error, scenes)
 
 
 def decibels(error: float) -> str:
@@ -80,13 +80,13 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     """
     if not math.isfinite(value.mean):
         return "–"
-    note = _note(value, scenes)
+    missing = note(value, scenes)
     few = value.scenes < FEWEST_SCENES and math.isfinite(value.least)  # NaN: of rounds, not scenes
     if few and value.least < value.most:
-        return f"{number(value.mean)} ({number(value.least)} to {number(value.most)}){note}"
+        return f"{number(value.mean)} ({number(value.least)} to {number(value.most)}){missing}"
     if few or not value.bounded:
-        return number(value.mean) + note
-    return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"
+        return number(value.mean) + missing
+    return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{missing}"
 
 
 def ratio_text(value: Ratio) -> str:
@@ -101,7 +101,7 @@ def ratio_text(value: Ratio) -> str:
     return f"{text} [{number(value.low)}, {number(value.high)}]" if value.bounded else text
 
 
-def _note(value: Interval, scenes: int | None) -> str:
+def note(value: Interval, scenes: int | None) -> str:
     """Note, in brackets, on values missing from a mean."""
     notes = [f"{value.undefined} undefined"] if value.undefined else []
     if scenes is not None and value.scenes < scenes:

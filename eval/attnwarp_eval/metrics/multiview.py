@@ -17,16 +17,6 @@ from attnwarp_eval.metrics.image import Distance, mse
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
 
-ABOVE_FLOOR = "multiview.delta_e_above"
-"""Prefix of metrics of disagreement above its floor."""
-
-BELOW_FLOOR = (
-    "Disagreement is **below its floor**, so negative, where edited views are more alike than the"
-    " true edited views. Something that differs between true views, such as shine, a shadow's edge"
-    " or fine texture, is lost there. Less is no gain there."
-)
-"""Meaning of a negative disagreement above the floor, in words for a report."""
-
 
 def above_floor(
     edited: tuple[Any, Any], truth: tuple[Any, Any], pair: TwoView, *, mask: Any = None

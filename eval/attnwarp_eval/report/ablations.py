@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES, number
-from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.compared import between, detectable_text, difference_text, no_verdict
-from attnwarp_eval.report.controls import BLIND, blind
-from attnwarp_eval.report.judging import Comparison, JudgedClaim, of_comparisons
-from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
-from attnwarp_eval.statistics.intervals import benjamini_hochberg
+from attnwarp_eval.document.numbers import FEWEST_SCENES, note, number, pooled, spread
+from attnwarp_eval.report.compared import between, detectable_text
+from attnwarp_eval.report.controls import UNCONTROLLED, outcome_of
+from attnwarp_eval.report.judging import Comparison, judged
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import ProbeReport, mean_values, report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
@@ -26,9 +22,6 @@ POOLED = (
     " scenes, with those of the ends of its interval; equal pictures have error 0."
 )
 
-NOTE = re.compile(r" \((?:\d+ undefined)?(?:, )?(?:(\d+) of \d+ scenes)?\)$")
-"""Note behind a mean: values and scenes that are missing."""
-
 MOST_LINES = 50
 """Largest number of lines of short tables on a page; the tables after them are folded."""
 
@@ -36,46 +29,7 @@ CLAIMED = "†"
 """Mark of a p-value that belongs to a claim."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Comparison of a variant with the baseline of its table, in one metric.
-
-    Attributes:
-        variant, metric: names of the variant and the metric.
-        difference: difference of the variant from the baseline.
-        p: p-value adjusted over the table, or over the claims if a claim makes this comparison.
-        claim: claim that makes this comparison, if any.
-        verdict: verdict; empty if no direction of the metric is better.
-    """
-
-    variant: str
-    metric: str
-    specification: Metric
-    difference: Contrast
-    p: float
-    claim: JudgedClaim | None
-    verdict: str
-
-    @property
-    def text(self) -> str:
-        """The difference, with the interval of the verdict's level."""
-        level = EQUAL_LEVEL if self.verdict == "equal" else self.difference.level(self.p)
-        return difference_text(self.difference, self.specification.unit, level)
-
-    @property
-    def short(self) -> str:
-        """The verdict, if it tells something."""
-        few = self.difference.scenes < FEWEST_SCENES or not any(self.difference.by_scene.values())
-        return "" if few or self.verdict == "can't tell" else self.verdict
-
-    @property
-    def outcome(self) -> str:
-        """The verdict; for fewer than six scenes, the number of scenes that agree."""
-        few = self.verdict and self.difference.scenes < FEWEST_SCENES
-        return no_verdict(self.difference) if few else self.verdict
-
-
-def differences(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
+def differences(results: Results, compared: Sequence[Sequence[Comparison]]) -> list[Section]:
     """The section with one short table for each ablation of the study; none without any."""
     if not compared:
         return []
@@ -139,32 +93,45 @@ def main_columns(own: ProbeReport, results: Results) -> dict[str, str]:
     return {titles.get(metric, metric): metric for metric in metrics or columns.values()}
 
 
-def _main(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Table:
-    own = report_of(ablation.probe)
-    columns = main_columns(own, results)
-    told = {(row.variant, row.metric): row.short for row in compared}
-    names, table = _names(ablation), {"variant": _names(ablation)}
-    for title, metric in columns.items():
-        means = [mean_values(results, own.name, name, [metric])[0] for name in names]
-        if set(means) == {"–"}:
+def _main(results: Results, ablation: Ablation, compared: Sequence[Comparison]) -> Table:
+    """Means of the main figures with their verdicts. What all means of a column lack stands in its
+    head.
+    """
+    report, count = report_of(ablation.probe), len(results.study.scenes)
+    verdicts = {
+        (one.b, one.metric): one.verdict
+        for one in compared
+        if one.contrast.scenes >= FEWEST_SCENES
+        and any(one.contrast.by_scene.values())
+        and one.word != "can't tell"
+    }
+    names, columns = _names(ablation), {"variant": _names(ablation)}
+    for title, metric in main_columns(report, results).items():
+        means = [results.mean(report.name, name, metric) for name in names]
+        if not any(mean.views for mean in means):
             continue
-        if len(notes := {(NOTE.search(mean) or [""])[0] for mean in means}) == 1:
-            title += notes.pop()
-            means = [NOTE.sub("", mean) for mean in means]
-        means = [NOTE.sub(lambda m: f" ({m[1]} scenes)" if m[1] else "", mean) for mean in means]
-        words = (told.get((name, metric), "") for name in names)
-        table[title] = [f"{mean} {word}".strip() for mean, word in zip(means, words, strict=True)]
-    cells = [list(row) for row in zip(*table.values(), strict=True)]
-    return Table(list(table), cells, ablation.title)
+        notes = [note(mean, count) * bool(mean.views) for mean in means]
+        if len(set(notes)) == 1:
+            title, notes = title + notes[0], [""] * len(notes)
+        else:
+            few = [bool(mean.views) and mean.scenes < count for mean in means]
+            notes = [f" ({m.scenes} scenes)" * f for m, f in zip(means, few, strict=True)]
+        shown = pooled if report.probe.metric(metric).squared else spread
+        columns[title] = [
+            f"{shown(replace(mean, undefined=0))}{of} {verdicts.get((name, metric), '')}".strip()
+            for name, mean, of in zip(names, means, notes, strict=True)
+        ]
+    rows = [list(row) for row in zip(*columns.values(), strict=True)]
+    return Table(list(columns), rows, ablation.title)
 
 
-def in_detail(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
+def in_detail(results: Results, compared: Sequence[Sequence[Comparison]]) -> list[Section]:
     """Folded sections, one for each ablation of the study."""
     tables = zip(_tabled(results), compared, strict=True)
     return [_section(own, ablation, rows) for (own, ablation), rows in tables]
 
 
-def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Section:
+def _section(results: Results, ablation: Ablation, compared: Sequence[Comparison]) -> Section:
     own, names = report_of(ablation.probe), _names(ablation)
     section = Section(f"In detail: {ablation.title}", folded=True)
     columns = own.columns_at(results.layer)
@@ -191,7 +158,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
         section.text.append(POOLED)
     if len(names) > 1:
         section.tables.append(_table(compared, ablation.baseline))
-        if any(row.claim is not None for row in compared):
+        if any(one.claim is not None for one in compared):
             section.text.append(
                 f"{CLAIMED} in the table of differences: a claim makes this comparison. p-value and"
                 " verdict are the claim's, adjusted over the claims and not over the table."
@@ -199,81 +166,69 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
     return section
 
 
-def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Row]]:
-    """Rows of each table of variants of the study, from :func:`rows_of`."""
-    claimed = of_comparisons(judged)
-    return [
-        rows_of(own, ablation, claimed if own is results else {})
-        for own, ablation in _tabled(results)
-    ]
+def compared_of(results: Results, claims: Sequence[Comparison]) -> list[list[Comparison]]:
+    """Comparisons of each table of variants of the study.
 
-
-def rows_of(
-    results: Results, ablation: Ablation, claimed: Mapping[Comparison, JudgedClaim]
-) -> list[Row]:
-    """Rows of each variant against the baseline, in each metric that its probe tests.
-
-    A comparison has one verdict in a report. So a comparison that a claim judges takes the claim's
-    verdict, and is not a test of this table.
+    A comparison has one verdict in a report. So one that a claim makes over all views takes the
+    claim's, and is not a test of its table.
 
     Args:
-        claimed: result of :func:`attnwarp_eval.report.judging.of_comparisons`.
+        claims: the judged claims of the run.
     """
-    own, baseline = report_of(ablation.probe), ablation.baseline
-    pairs = [
-        (name, metric.format(layer=results.layer))
-        for name in ablation.variants
-        if name != baseline
-        for metric in own.contrasts
+    claimed = {
+        (one.probe, one.metric, frozenset((one.a, one.b))): one
+        for one in claims
+        if one.claim is not None and one.claim.yaw is None and one.word != "not finished"
+    }
+    return [
+        judged(_comparisons(of, ablation, claimed if of is results else {}))
+        for of, ablation in _tabled(results)
     ]
-    differences = [between(results, own.name, baseline, *pair) for pair in pairs]
-    of_claims = [claimed.get((own.name, m, frozenset({baseline, n}))) for n, m in pairs]
-    adjusted = benjamini_hochberg(
-        [
-            difference.flips.p if claim is None else math.nan
-            for difference, claim in zip(differences, of_claims, strict=True)
-        ]
-    )
 
-    @cache
-    def unseen(metric: str) -> bool:
-        return own.probe.edits and blind(results, own.name, metric, baseline)
 
+def _comparisons(
+    results: Results,
+    ablation: Ablation,
+    claimed: Mapping[tuple[str, str, frozenset[str]], Comparison],
+) -> Iterator[Comparison]:
+    """Each variant against the baseline, in each metric that the probe tests."""
+    name, baseline = ablation.probe, ablation.baseline
+    metrics = [metric.format(layer=results.layer) for metric in report_of(name).contrasts]
+    edits, control = probe(name).edits, UNCONTROLLED
+    outcomes = {m: outcome_of(results, name, m, baseline) if edits else control for m in metrics}
+    for variant in ablation.variants:
+        for metric in metrics if variant != baseline else ():
+            value = between(results, name, baseline, variant, metric)
+            better = probe(name).metric(metric).direction
+            direction = better if better in ("higher", "lower") else None
+            one = Comparison(name, metric, baseline, variant, value, direction, outcomes[metric])
+            claim = claimed.get((name, metric, frozenset((baseline, variant))))
+            if claim is not None and direction is not None:
+                word = claim.word
+                if word in ("better", "worse"):  # of what the claim expects
+                    word = value.verdict(direction, adjusted_p=claim.p)
+                one = replace(one, claim=claim.claim, p=claim.p, word=word)
+            yield one
+
+
+def _table(compared: Sequence[Comparison], baseline: str) -> Table:
     rows = []
-    for pair, difference, of_table, claim in zip(
-        pairs, differences, adjusted, of_claims, strict=True
-    ):
-        specification = own.probe.metric(pair[1])
-        p = of_table if claim is None else claim.p
-        outcome = ""
-        if claim is not None and claim.verdict in ("blind", "equal"):
-            outcome = claim.verdict
-        elif specification.direction in ("higher", "lower"):
-            outcome = difference.verdict(specification.direction, adjusted_p=p)
-            if outcome == "can't tell" and unseen(pair[1]):
-                outcome = BLIND
-        rows.append(Row(*pair, specification, difference, p, claim, outcome))
-    return rows
-
-
-def _table(compared: Sequence[Row], baseline: str) -> Table:
-    rows = []
-    for row in compared:
-        difference = row.difference
-        judged = row.outcome or "–"
-        if difference.views == 0:
-            judged = "not measured"
-        elif not any(difference.by_scene.values()):
-            judged = "same values"
+    for one in compared:
+        verdict = one.verdict or "–"
+        if one.contrast.views == 0:
+            verdict = "not measured"
+        elif not any(one.contrast.by_scene.values()):
+            verdict = "same values"
         rows.append(
             [
-                row.variant,
-                row.metric,
-                row.text,
-                judged,
-                detectable_text(difference),
-                number(row.p) + (f" {CLAIMED}" if row.claim is not None else ""),
-                f"{difference.scenes}, {difference.views}",
+                one.b,
+                one.metric,
+                one.difference,
+                verdict,
+                detectable_text(one.contrast),
+                number(one.p) + (f" {CLAIMED}" if one.claim is not None else ""),
+                f"{one.contrast.scenes}, {one.contrast.views}",
+                number(one.contrast.student.p),
             ]
         )
     columns = [
@@ -284,5 +239,6 @@ def _table(compared: Sequence[Row], baseline: str) -> Table:
         "smallest that one test alone would see",
         "adjusted p",
         "scenes, views",
+        "p by Student's t",
     ]
     return Table(columns, rows, f"Differences from {baseline!r}, with verdicts")

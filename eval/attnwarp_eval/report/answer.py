@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.compared import in_words
+from attnwarp_eval.report.compared import in_words, unit_in_words, without_unit
 from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, side_by_side
@@ -99,13 +99,14 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
         if title == asked.decides:
             decided = leaders
         # A unit shared by all figures is shown once, in the column's head.
-        _, _, unit = in_words(1.0, metric, key).partition(" ")
+        unit = unit_in_words(metric, key)
         columns.append(title if unit in ("", "%") else f"{title}, {unit}")
+        percent = " %" * (unit == "%")
         for name, (value, _) in figures.items():
-            text = _cell(value.mean, metric, key, unit)
+            text = without_unit(value.mean, metric) + percent * math.isfinite(value.mean)
             text = f"**{text}**" if name in leaders else text
             if value.scenes and 1 < len(results.study.scenes) < FEWEST_SCENES:
-                text += f" ({_each(results, column, name, unit)})"
+                text += f" ({_each(results, column, name, metric)}{percent})"
             if value.undefined and value.views:
                 text += f", {value.undefined} undefined"
             rows[name].append(text)
@@ -119,19 +120,12 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
     return Table([*columns, *timed], list(rows.values()), timed=timed), decided
 
 
-def _each(results: Results, column: AnswerColumn, variant: str, unit: str) -> str:
-    """Means of the scenes side by side, in the study's order."""
+def _each(results: Results, column: AnswerColumn, variant: str, metric: Metric) -> str:
+    """Means of the scenes side by side, without a unit, in the study's order."""
     key = column.metric.format(layer=results.layer)
-    metric = probe(column.probe).metric(key)
     table = results.views(column.probe, variant, key, column.yaw)
-    means = [over_scenes({s: table.get(s, {})}).mean for s in results.study.scene_names]
-    texts = [_cell(mean, metric, key, unit) if math.isfinite(mean) else "–" for mean in means]
-    return ", ".join(text.removesuffix(" %") for text in texts) + (" %" if unit == "%" else "")
-
-
-def _cell(value: float, metric: Metric, key: str, unit: str) -> str:
-    text = in_words(value, metric, key)
-    return text if unit == "%" else text.removesuffix(f" {unit}")
+    means = (over_scenes({s: table.get(s, {})}).mean for s in results.study.scene_names)
+    return ", ".join(without_unit(x, metric) if math.isfinite(x) else "–" for x in means)
 
 
 def _leaders(values: Mapping[str, float], metric: Metric) -> list[str]:

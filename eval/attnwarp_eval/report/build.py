@@ -12,7 +12,7 @@ from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.controls import controls
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
-from attnwarp_eval.report.judging import claims_in_detail, claims_section, judge
+from attnwarp_eval.report.judging import claims_section, judge
 from attnwarp_eval.report.measured import failures, meanings, measured
 from attnwarp_eval.study.probe_report import Layout, reports
 from attnwarp_eval.study.results import Results
@@ -35,7 +35,6 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         *([] if claims is None else [claims]),
         *differences(results, compared),
         *controls(results),
-        *claims_in_detail(results, judged),
         *in_detail(results, compared),
         *(section for section in of_probes if not section.leads),
         *(fronts(results, layout) if timings else []),

@@ -1,4 +1,4 @@
-"""Claims of claims.yaml, and their measurement from a run."""
+"""Claims of claims.yaml."""
 
 from __future__ import annotations
 
@@ -9,20 +9,11 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from attnwarp_eval.report.compared import between
-from attnwarp_eval.report.controls import Share, control_share
 from attnwarp_eval.scene.yaml import read_yaml
-from attnwarp_eval.statistics.contrasts import Contrast
-from attnwarp_eval.statistics.intervals import ByView, Interval, common, over_scenes
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study
-from attnwarp_eval.study.study import parse_variant
 
 DECLARED = resources.files("attnwarp_eval.report") / "claims.yaml"
-
-Seen = Literal["", "seen", "not seen", "not measured"]
-"""Outcome of a claim's control; empty without a control."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +28,7 @@ class Claim:
     expect: Literal["higher", "lower"]
     b: Mapping[str, Any]
     study: str = ""
-    scenes: Mapping[str, int] | None = None
+    scenes: Mapping[str, Any] | None = None
     yaw: tuple[float, float] | None = None
     equal_within: float | str | None = None
     control: Mapping[str, Any] | None = None
@@ -45,11 +36,6 @@ class Claim:
     headline: int = 0
     plain: str = ""
     context: str = ""
-
-    @property
-    def sign(self) -> int:
-        """Expected sign of the contrast."""
-        return 1 if self.expect == "higher" else -1
 
     @property
     def bound(self) -> float | None:
@@ -70,61 +56,23 @@ class Claim:
         ratio = probe(self.probe).metric(self.metric).scale == "ratio"
         return math.log1p(share) if ratio else share
 
-    def judged_by(self, study: Study) -> bool:
-        """Return True for the study that judges the claim, with the scenes planned for it."""
+    @property
+    def bound_in_words(self) -> str:
+        """Bound of equality with its unit: a share's in points."""
+        metric = probe(self.probe).metric(self.metric)
+        if not isinstance(self.equal_within, str):
+            return f"{self.equal_within} {metric.unit}"
+        number = self.equal_within.removesuffix(" %")
+        points = "point" if number == "1" else "points"
+        return f"{number} {points if metric.scale == 'share' else '%'}"
+
+    def planned(self, study: Study) -> bool:
+        """Return True if the study has all scenes, the size and the seeds that were planned."""
         drawn = study.population
-        return study.name == self.study and (
-            drawn is not None and self.scenes in (None, {"drawn": drawn.count, "seed": drawn.seed})
-        )
-
-    def measure(self, results: Results) -> Measured | None:
-        """Measure the sides of the claim; None if the run lacks a variant of that content."""
-        metric = self.metric.replace("{layer}", str(results.layer))
-        a, b = (variant_like(results, side, self.probe) for side in (self.a, self.b))
-        if a is None or b is None:
-            return None
-        first, second = (results.views(self.probe, who, metric, self.yaw) for who in (a, b))
-        value = between(results, self.probe, a, b, metric, self.yaw)
-        # Means over the shared views: only their difference is the claim's.
-        sides = dict(zip((a, b), map(over_scenes, common([first, second])), strict=True))
-        control, share = self._control(results, b, first, second)
-        return Measured(metric, sides, first, second, value, control, share)
-
-    def _control(
-        self, results: Results, reference: str, first: ByView, second: ByView
-    ) -> tuple[Seen, Share | None]:
-        """Test at 5 % whether the run detects the claim's control; the control's share of a gain
-        from the first table to the second, if it has to be worse in the claim's own metric.
-        """
-        if self.control is None:
-            return "", None
-        key = str(self.control.get("metric", self.metric)).replace("{layer}", str(results.layer))
-        direction = probe(self.probe).metric(key).direction
-        expected = "worse" if "worse" in self.control else "better"
-        label = variant_like(results, self.control[expected], self.probe)
-        if label is None or direction not in ("higher", "lower"):
-            return "not measured", None
-        found = between(results, self.probe, reference, label, key, self.yaw).verdict(direction)
-        share = None
-        if expected == "worse" and "metric" not in self.control:
-            table = results.views(self.probe, label, key, self.yaw)
-            share = control_share(second, table, first, sign=1 if direction == "higher" else -1)
-        return "seen" if found == expected else "not seen", share
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Sides of a claim by name, the two tables whose difference it predicts, that difference on the
-    scale of the figure, whether the claim's control was detected, and its share of a gain.
-    """
-
-    metric: str
-    sides: dict[str, Interval]
-    a: ByView
-    b: ByView
-    contrast: Contrast
-    control: Seen = ""
-    share: Share | None = None
+        if drawn is None or len(study.scenes) < drawn.count:
+            return False
+        has = {"drawn": drawn.count, "seed": drawn.seed, "size": study.size, "seeds": study.seeds}
+        return self.scenes is None or {"seeds": [0], **self.scenes} == has
 
 
 @cache
@@ -134,15 +82,3 @@ def load_claims() -> tuple[Claim, ...]:
     return tuple(
         Claim(**entry, scenes=family["scenes"][entry["study"]]) for entry in family["claims"]
     )
-
-
-def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | None:
-    """Name of the first measured variant with the meaning of ``data``, as in a study's YAML."""
-    asked, study = probe(name), results.study
-    if name not in study.probes:
-        return None
-    meaning = asked.meaning(study, parse_variant(dict(data)))
-    for label, variant in study.variants.items():
-        if results.records(name, label) and asked.meaning(study, variant) == meaning:
-            return label
-    return None

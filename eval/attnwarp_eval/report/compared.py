@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from attnwarp_eval.metrics.counted import COUNTED
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView
-from attnwarp_eval.statistics.signflips import SignFlips
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.results import Results
 
@@ -112,6 +109,26 @@ _UNITS = {
 """Unit of a metric -> the word after its figure, for figures shown unconverted."""
 
 
+def unit_in_words(metric: Metric, key: str) -> str:
+    """Unit behind a figure in a sentence; ``key`` is as for :func:`in_words`."""
+    if metric.unit in ("share", "ratio"):
+        return "%"
+    if metric.unit == "layer px":
+        grid = key.rpartition(".")[2]
+        return f"px of a {grid} grid" if grid.isdigit() else "px of the grid"
+    return _UNITS.get(metric.unit, "")
+
+
+def without_unit(value: float, metric: Metric) -> str:
+    """A figure for a sentence without its unit: in percent for a share."""
+    if not math.isfinite(value):
+        return "undefined"
+    if metric.unit in ("share", "ratio"):
+        percent = 100 * value
+        return f"{percent:.0f}" if abs(percent) >= 10 else number(percent, 2)
+    return number(value, 2 if abs(value) < 10 else 3)
+
+
 def in_words(value: float, metric: Metric, key: str) -> str:
     """Format a figure with its unit for a sentence.
 
@@ -128,16 +145,8 @@ def in_words(value: float, metric: Metric, key: str) -> str:
         >>> in_words(0.4671, METRICS[key], key)
         '0.47 px of a 64 grid'
     """
-    if not math.isfinite(value):
-        return "undefined"
-    if metric.unit in ("share", "ratio"):
-        percent = 100 * value
-        return f"{percent:.0f} %" if abs(percent) >= 10 else f"{number(percent, 2)} %"
-    text = number(value, 2 if abs(value) < 10 else 3)
-    if metric.unit == "layer px":
-        grid = key.rpartition(".")[2]
-        return f"{text} px of a {grid} grid" if grid.isdigit() else f"{text} px of the grid"
-    return f"{text} {_UNITS.get(metric.unit, '')}".strip()
+    unit = unit_in_words(metric, key) if math.isfinite(value) else ""
+    return f"{without_unit(value, metric)} {unit}".strip()
 
 
 def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
@@ -170,23 +179,6 @@ def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
     brackets = "" if lone else f" ({texts[1]} to {texts[2]}{behind})"
     note = f" ({value.undefined} undefined)" if value.undefined else ""
     return f"{texts[0]}{behind}{brackets}{note}"
-
-
-def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
-    """The difference of each of the scenes, in order; a dash where it is undefined.
-
-    Example:
-        >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(2)} for v in (1.0, 0.6)]
-        >>> scene_texts(contrast(*tables, "ratio"), "px", ["s0", "s1", "s2"])
-        ['-40 %', '-40 %', '–']
-    """
-
-    def alone(scene: str) -> Contrast:
-        own = {scene: value.by_scene[scene]} if scene in value.by_scene else {}
-        flips = SignFlips(np.array(list(own.values())), value.flips.rounding)
-        return replace(value, by_scene=own, flips=flips, undefined=0)
-
-    return [difference_text(alone(scene), unit) for scene in scenes]
 
 
 def no_verdict(value: Contrast) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.report.compared import between
+from attnwarp_eval.statistics.contrasts import Verdict
 from attnwarp_eval.statistics.intervals import ByView, common
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
@@ -19,23 +20,62 @@ from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.controls import OTHER_SEED
 from attnwarp_eval.study.shared.edits import VariantPart
 
-BLIND: Literal["blind"] = "blind"
-"""Replacement of "can't tell" if the study's control failed."""
-
 HALF = 0.5
 """Share of a gain that features from a wrong place reach, above which it is no evidence."""
 
-DRAWS = 1000
-"""Number of resamples of scenes for the interval of a control's share."""
+DRAWS, TAIL = 1000, 0.025
+"""Number of resamples of scenes for the interval of a control's share, and their part beyond each
+of its ends."""
 
 Share = tuple[float, float, float]
 """Share of a gain that a control reaches, and the ends of its 95 % interval."""
 
 
+KEPT = {"worse": ("worse",), "better": (), "": ("better", "worse")}
+"""Expectation of a control that is not seen -> tests that keep their meaning: a loss, but no gain
+of a method whose wrong features do as well; beside the controls of a study, both."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a comparison's control; "none" without one.
+
+    Attributes:
+        expected: expectation of it, against the comparison's last side; empty for the controls of a
+            study, which say what its null results are worth.
+        share: share of the gain that it reaches, if it has to be worse in the same figure.
+    """
+
+    seen: Literal["none", "seen", "not seen", "not measured"] = "none"
+    expected: Literal["worse", "better", ""] = ""
+    share: Share | None = None
+
+
+UNCONTROLLED = Outcome()
+
+
+def word_of(test: Verdict, control: Outcome) -> Literal[Verdict, "blind"]:
+    """Verdict of a test beside its control.
+
+    Example:
+        >>> word_of("better", Outcome("not seen", "worse")), word_of("equal", Outcome("not seen"))
+        ('blind', 'blind')
+        >>> word_of("better", Outcome("seen", "worse", share=(0.6, 0.4, 0.8)))
+        'blind'
+    """
+    if control.seen == "not measured":
+        return "can't tell"
+    if control.seen == "not seen":
+        return test if test in KEPT[control.expected] else "blind"
+    share = 0.0 if control.share is None else control.share[0]
+    return "blind" if test in ("better", "worse") and share >= HALF else test
+
+
 def control_share(method: ByView, control: ByView, alone: ByView, *, sign: int = 1) -> Share:
     """Share of a method's gain that a control reaches, with its 95 % interval.
 
-    Scenes are drawn with replacement. NaN without a gain.
+    Scenes are drawn with replacement. A draw without a gain bounds the share on neither side, so it
+    lies beyond both ends; if these are 2.5 % of the draws, there are no ends. NaN without a gain.
 
     Args:
         method, control, alone: figures of the method, of its control, and without either.
@@ -52,16 +92,18 @@ def control_share(method: ByView, control: ByView, alone: ByView, *, sign: int =
         return np.nan, np.nan, np.nan
     count = means.shape[1]
     drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
-
-    def share(of: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        gain = sign * (of[0] - of[2])
-        return np.where(gain > 0, sign * (of[1] - of[2]), np.nan) / np.where(gain > 0, gain, 1)
-
-    mean, shares = float(share(means.mean(axis=-1))), share(means[:, drawn].mean(axis=-1))
-    shares = shares[np.isfinite(shares)]
-    if not len(shares):
-        return mean, np.nan, np.nan
-    return mean, *np.quantile(shares, [0.025, 0.975]).tolist()
+    gain, reached = sign * (means[0] - means[2]), sign * (means[1] - means[2])
+    gains, shares = gain[drawn].mean(axis=1), reached[drawn].mean(axis=1)
+    shares /= np.where(gains > 0, gains, 1)
+    lost = np.count_nonzero(gains <= 0)
+    mean = float(reached.mean() / gain.mean()) if gain.mean() > 0 else np.nan
+    if lost >= TAIL * DRAWS:
+        return mean, -np.inf, np.inf
+    low, high = (
+        np.quantile(np.where(gains > 0, shares, beyond), at)
+        for beyond, at in ((-np.inf, TAIL), (np.inf, 1 - TAIL))
+    )
+    return mean, float(low), float(high)
 
 
 def share_text(share: Share) -> str:
@@ -79,7 +121,7 @@ def share_text(share: Share) -> str:
     if share[2] < 0:
         return "worse than both sides"
     mean, low, high = (number(100 * value, 2) for value in share)
-    return f"{mean} % ({low} to {high} %)"
+    return f"{mean} % ({low} to {high} %)" if np.isfinite(share[2]) else f"{mean} % (no bounds)"
 
 
 def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
@@ -107,15 +149,18 @@ def seen(results: Results, name: str, metric: str, baseline: str, label: str) ->
     return judged in (("better", "worse") if other_seed else ("worse",))
 
 
-def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
-    """Return True if a study has controls of a variant, and a figure separates none from it.
+def outcome_of(results: Results, name: str, metric: str, baseline: str) -> Outcome:
+    """Outcome of a variant's controls in a figure: seen if it separates any of them from it.
 
     Features from the wrong place must do worse. Otherwise the figure does not depend on the
     source of features, so "can't tell" about two warps says nothing.
     """
-    found = controls_of(results, name, baseline)
-    wrong = [label for label, control in found.items() if control != OTHER_SEED]
-    return bool(wrong) and not any(seen(results, name, metric, baseline, label) for label in wrong)
+    of = controls_of(results, name, baseline).items()
+    wrong = [label for label, control in of if control != OTHER_SEED]
+    if not wrong:
+        return UNCONTROLLED
+    any_seen = any(seen(results, name, metric, baseline, label) for label in wrong)
+    return Outcome("seen" if any_seen else "not seen")
 
 
 def controls(results: Results) -> list[Section]:
@@ -142,8 +187,8 @@ def controls(results: Results) -> list[Section]:
 
 
 def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:
-    found = controls_of(results, name, baseline)
-    if not found:
+    controls = controls_of(results, name, baseline)
+    if not controls:
         return
     metrics = [metric.format(layer=results.layer) for metric in report_of(name).contrasts]
     metrics = [m for m in metrics if probe(name).metric(m).direction in ("higher", "lower")]
@@ -156,9 +201,12 @@ def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:
                 for metric in metrics
             ),
         ]
-        for label, control in found.items()
+        for label, control in controls.items()
     ]
-    if set(found.values()) != {OTHER_SEED}:
-        answers = [BLIND if blind(results, name, m, baseline) else "sees" for m in metrics]
+    if set(controls.values()) != {OTHER_SEED}:
+        answers = [
+            "sees" if outcome_of(results, name, m, baseline).seen == "seen" else "blind"
+            for m in metrics
+        ]
         rows.append(["this figure is", "", *answers])
     yield Table(["control", "expected", *metrics], rows, f"Controls of {baseline!r}")

@@ -1,143 +1,115 @@
-"""Verdicts on claims, each from its one judging study, adjusted together; and their section."""
+"""The one path from two variants of a run to a word, for claims and for tables of variants."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import fmean
-from typing import Literal
+from typing import Any, Literal
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
-from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
-from attnwarp_eval.report.claims import Claim, Measured
-from attnwarp_eval.report.compared import difference_text, in_words, no_verdict, scene_texts
-from attnwarp_eval.report.controls import HALF, share_text
-from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
-from attnwarp_eval.statistics.intervals import (
-    ROUNDING,
-    Interval,
-    agreement,
-    benjamini_hochberg,
-    common,
-    paired,
-)
+from attnwarp_eval.document.numbers import FEWEST_SCENES
+from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.report.claims import Claim
+from attnwarp_eval.report.compared import between, difference_text, in_words, no_verdict
+from attnwarp_eval.report.controls import UNCONTROLLED, Outcome, control_share, share_text, word_of
+from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast, Verdict
+from attnwarp_eval.statistics.intervals import benjamini_hochberg, common, over_scenes
 from attnwarp_eval.statistics.planning import MOST_SCENES
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.study import parse_variant
 
-Verdict = Literal["holds", "the opposite holds", "equal", "can't tell", "blind"]
-
-Here = Literal["seen", "seen where defined", "mixed", "not seen"]
+Word = Literal[Verdict, "blind", "not finished", ""]
 
 
 @dataclass(frozen=True)
-class JudgedClaim:
-    """A claim, its measurement in a run, and the verdict.
+class Comparison:
+    """Two variants of a run in one figure.
 
     Attributes:
-        agreement: numbers of views with the expected sign, and of all views.
-        here: result on the run's scenes.
-        below_floor: number of scenes in which both sides disagree less than true views.
-        judges: whether the run belongs to the claim's judging study, on a sample.
-        p: adjusted p-value; unadjusted before :func:`decided`.
-        verdict: verdict; None if another study judges.
+        metric: name of the figure in records.
+        a, b: labels of the variants; the difference is that of b from a.
+        direction: values that are better, or that the claim expects; None judges nothing.
+        control: outcome of the comparison's control.
+        claim: claim that makes this comparison, if any.
+        means: means of a and of b over the views that both have, for a claim.
+        p: p-value adjusted over the family; NaN before :func:`judged`.
+        word: verdict; empty before :func:`judged`, and without a direction.
     """
 
-    claim: Claim
-    measured: Measured
-    agreement: tuple[int, int]
-    here: Here
-    below_floor: tuple[str, ...]
-    judges: bool
-    p: float
-    verdict: Verdict | None = None
+    probe: str
+    metric: str
+    a: str
+    b: str
+    contrast: Contrast
+    direction: Literal["higher", "lower"] | None
+    control: Outcome = UNCONTROLLED
+    claim: Claim | None = None
+    means: tuple[float, float] = (math.nan, math.nan)
+    p: float = math.nan
+    word: Word = ""
 
     @property
-    def contrast(self) -> Contrast:
-        """The difference, on the scale of its figure."""
-        return self.measured.contrast
+    def specification(self) -> Metric:
+        """Specification of the figure."""
+        return probe(self.probe).metric(self.metric)
 
     @property
-    def metric(self) -> str:
-        """Name of the figure."""
-        return self.measured.metric
-
-    @property
-    def sides(self) -> dict[str, Interval]:
-        """Mean of each side."""
-        return self.measured.sides
+    def bound(self) -> float | None:
+        """Bound of equality, of a claim."""
+        return None if self.claim is None else self.claim.bound
 
     @property
     def difference(self) -> str:
         """The difference in words, with the interval of the verdict's level."""
-        level = EQUAL_LEVEL if self.verdict == "equal" else 0.95
-        if self.verdict not in (None, "equal"):
-            level = self.contrast.level(self.p)
-        return difference_text(
-            self.contrast, probe(self.claim.probe).metric(self.metric).unit, level
-        )
+        bounded = self.word in ("equal", "within")
+        level = EQUAL_LEVEL if bounded else self.contrast.level(self.p)
+        return difference_text(self.contrast, self.specification.unit, level)
 
     @property
-    def told(self) -> bool:
-        """True if there is a verdict other than "can't tell"."""
-        return self.verdict in ("holds", "the opposite holds", "equal")
-
-    @property
-    def one_computation(self) -> bool:
-        """True if the sides are equal to the last digit everywhere: what parts them had no effect,
-        so nothing was tried.
+    def verdict(self) -> str:
+        """The word, with the bound that it speaks of; for fewer than six scenes the number that
+        agree.
         """
-        return not any(self.contrast.by_scene.values())
-
-    @property
-    def in_words(self) -> str:
-        """The verdict; for "can't tell", also the scenes needed to tell; for fewer than six scenes,
-        the number that agree; for a claim of another study, that study's name.
-        """
-        if self.verdict is None:
-            return f"judged by `{self.claim.study}`"
-        if self.contrast.scenes < FEWEST_SCENES:
+        if self.word and self.contrast.scenes < FEWEST_SCENES:
             return no_verdict(self.contrast)
-        if self.verdict == "equal":
-            return f"equal within {_bound(self.claim)}"
-        if self.verdict != "can't tell":
-            return self.verdict
-        if self.measured.control == "not measured":
-            return "can't tell: its control was not measured"
-        if self.one_computation:
-            return "can't tell: both sides are equal to the last digit"
-        needed = self.contrast.needed(self.p, self.claim.bound)
-        return f"can't tell: {count_of(needed)} scenes would"
+        if self.claim is None or self.word not in ("equal", "within"):
+            return self.word
+        if self.word == "equal":
+            return f"equal within {self.claim.bound_in_words}"
+        more = "more" if self.contrast.flips.mean > 0 else "less"
+        return f"{more}, by less than {self.claim.bound_in_words}"
 
     @property
-    def means(self) -> str:
-        """Mean of each side in words, in the order of the claim."""
-        metric = probe(self.claim.probe).metric(self.metric)
-        means = [in_words(side.mean, metric, self.metric) for side in self.sides.values()]
-        return " against ".join(reversed(means))
+    def reason(self) -> str:
+        """Reason of "can't tell": what lacks, or the scenes that would tell; else empty."""
+        if self.word != "can't tell" or self.contrast.scenes < FEWEST_SCENES:
+            return ""
+        if self.control.seen == "not measured":
+            return "its control was not measured"
+        if not any(self.contrast.by_scene.values()):
+            return "both sides are equal to the last digit"
+        return f"{count_of(self.contrast.needed(self.p, self.bound))} scenes would"
 
-    @property
-    def control(self) -> str:
-        """Outcome of the control in words, with its share of a gain that was told."""
-        share, told = self.measured.share, self.verdict in ("holds", "the opposite holds", "blind")
-        if told and share is not None and math.isfinite(share[0]):
-            return f"{self.measured.control}: {share_text(share)}"
-        return self.measured.control or "none"
 
-    @property
-    def row(self) -> tuple[str, ...]:
-        """Cells of a table of claims."""
-        return (
-            self.claim.text,
-            self.in_words,
-            self.difference,
-            self.means,
-            str(self.contrast.scenes),
-            self.control,
-        )
+def judged(family: Iterable[Comparison]) -> list[Comparison]:
+    """Comparisons with words, p-values adjusted over those without one (Benjamini-Hochberg).
+
+    Args:
+        family: rows of a table, or claims of one run or of the runs of all judging studies.
+    """
+    every = list(family)
+    adjusted = benjamini_hochberg([math.nan if c.word else c.contrast.flips.p for c in every])
+    return [c if c.word else _judged(c, p) for c, p in zip(every, adjusted, strict=True)]
+
+
+def _judged(one: Comparison, p: float) -> Comparison:
+    if one.direction is None:
+        return replace(one, p=p)
+    test = one.contrast.verdict(one.direction, adjusted_p=p, bound=one.bound)
+    return replace(one, p=p, word=word_of(test, one.control))
 
 
 def count_of(scenes: int) -> str:
@@ -150,196 +122,129 @@ def count_of(scenes: int) -> str:
     return f"over {MOST_SCENES}" if scenes > MOST_SCENES else str(scenes)
 
 
-def _bound(claim: Claim) -> str:
-    metric = probe(claim.probe).metric(claim.metric)
-    if isinstance(claim.equal_within, str):
-        return (
-            claim.equal_within.replace("%", "points")
-            if metric.scale == "share"
-            else (claim.equal_within)
-        )
-    return f"{claim.equal_within} {metric.unit}"
+def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | None:
+    """Name of the first measured variant with the meaning of ``data``, as in a study's YAML."""
+    own, study = probe(name), results.study
+    if name not in study.probes:
+        return None
+    meaning = own.meaning(study, parse_variant(dict(data)))
+    for label, variant in study.variants.items():
+        if results.records(name, label) and own.meaning(study, variant) == meaning:
+            return label
+    return None
 
 
-def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
-    """Every claim that the run has measurements for; claims that its study judges have a verdict,
-    adjusted over them.
-
+def measured(results: Results, claims: Iterable[Claim]) -> list[Comparison]:
+    """The comparison of every claim that the run has measurements for; "not finished" if not all
+    of it was measured as planned.
     """
-    return decided(found(results, claims))
+    comparisons = (_measured(results, claim) for claim in claims)
+    return [one for one in comparisons if one is not None and one.contrast.by_scene]
 
 
-def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
-    """Every claim that the run has measurements for, before a verdict."""
-    judged = []
-    for claim in claims:
-        measured = claim.measure(results)
-        if measured is None or not measured.contrast.by_scene:
-            continue
-        judged.append(
-            JudgedClaim(
-                claim,
-                measured,
-                agreement(measured.a, measured.b, claim.sign),
-                _here(claim, measured, len(results.study.scenes)),
-                _below_floor(measured),
-                claim.judged_by(results.study),
-                measured.contrast.flips.p,
-            )
-        )
-    return judged
+def _measured(results: Results, claim: Claim) -> Comparison | None:
+    """None if the run lacks a variant of that content."""
+    name, layer = claim.probe, str(results.layer)
+    metric = claim.metric.replace("{layer}", layer)
+    a, b = (variant_like(results, side, name) for side in (claim.a, claim.b))
+    if a is None or b is None:
+        return None
+    names, control = {a, b}, UNCONTROLLED
+    tables = [results.views(name, who, metric, claim.yaw) for who in (a, b)]
+    if claim.control is not None:
+        key = str(claim.control.get("metric", claim.metric)).replace("{layer}", layer)
+        direction = probe(name).metric(key).direction
+        expected: Literal["worse", "better"] = "worse" if "worse" in claim.control else "better"
+        label = variant_like(results, claim.control[expected], name)
+        control = Outcome("not measured", expected)
+        if label is not None and direction in ("higher", "lower"):
+            names.add(label)
+            seen = between(results, name, b, label, key, claim.yaw).verdict(direction) == expected
+            share = None
+            if expected == "worse" and "metric" not in claim.control:
+                table = results.views(name, label, key, claim.yaw)
+                sign = 1 if direction == "higher" else -1
+                share = control_share(tables[1], table, tables[0], sign=sign)
+            control = Outcome("seen" if seen else "not seen", expected, share)
+    finished = claim.planned(results.study) and all(
+        cell.record is not None
+        for cell in results.cells
+        if cell.probe == name and names.intersection(cell.variants)
+    )
+    first, second = (over_scenes(table).mean for table in common(tables))
+    return Comparison(
+        name, metric, a, b, between(results, name, a, b, metric, claim.yaw), claim.expect,
+        control, claim, (first, second), word="" if finished else "not finished",
+    )  # fmt: skip
 
 
-def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
-    """Claims with their verdicts, p-values adjusted over all judged claims
-    (Benjamini-Hochberg).
-
-    Args:
-        claims: claims of one run, or of the runs of all judging studies.
-    """
-    every = list(claims)
-    adjusted = benjamini_hochberg([c.p if c.judges else float("nan") for c in every])
-    return [
-        replace(c, p=p, verdict=_verdict(c, p) if c.judges else None)
-        for c, p in zip(every, adjusted, strict=True)
-    ]
-
-
-def _verdict(judged: JudgedClaim, p: float) -> Verdict:
-    claim, control = judged.claim, judged.measured.control
-    if control == "not measured" or judged.one_computation:
-        return "can't tell"
-    told = judged.contrast.verdict(claim.expect, adjusted_p=p, bound=claim.bound)
-    if control == "not seen":
-        # If wrong features do as well, a gain from the right ones and every null result lose their
-        # meaning. A loss keeps its meaning.
-        lost = told == "worse" and "worse" in (claim.control or {})
-        return "the opposite holds" if lost else "blind"
-    share = judged.measured.share
-    if told in ("better", "worse") and share is not None and share[0] >= HALF:
-        return "blind"
-    words: dict[str, Verdict] = {"better": "holds", "worse": "the opposite holds", "equal": "equal"}
-    return words.get(told, "can't tell")
-
-
-Comparison = tuple[str, str, frozenset[str]]
-"""Key of a comparison: a probe, a metric and two variants."""
-
-
-def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, JudgedClaim]:
-    """The claim that judges each comparison of two variants over all views: tables show the claim's
-    verdict for such a comparison.
-    """
-    return {
-        (one.claim.probe, one.metric, frozenset(one.sides)): one
-        for one in judged
-        if one.claim.yaw is None and one.verdict is not None
-    }
-
-
-def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
-    """Describe whether the mean difference has the expected sign in every scene.
-
-    ``scenes``: number of the study's scenes. A scene without values cannot show the expected sign.
-    """
-    shared = common([measured.a, measured.b])
-    values = [abs(x) for table in shared for views in table.values() for x in views.values()]
-    rounding = ROUNDING * max(values, default=0.0)
-    differences = [paired({s: shared[0][s]}, {s: shared[1][s]}) for s in shared[0]]
-    signs = [one.mean * claim.sign > rounding for one in differences]
-    if not all(signs):
-        return "mixed" if any(signs) else "not seen"
-    return "seen" if len(signs) == scenes else "seen where defined"
-
-
-def _below_floor(measured: Measured) -> tuple[str, ...]:
-    if not measured.metric.startswith(ABOVE_FLOOR):
-        return ()
-    a, b = common([measured.a, measured.b])
-    return tuple(s for s in a if max(fmean(a[s].values()), fmean(b[s].values())) < 0)
+def judge(results: Results, claims: Iterable[Claim]) -> list[Comparison]:
+    """Claims that the run's study judges with their verdicts, adjusted over them."""
+    return judged(measured(results, (c for c in claims if c.study == results.study.name)))
 
 
 OUTCOMES = {
     "holds": "As expected",
     "the opposite holds": "The opposite of what was expected",
+    "within": "A difference within a bound",
     "equal": "No difference, within a bound",
     "can't tell": "Cannot be told",
     "blind": "No verdict, since the control failed",
+    "not finished": "Not finished as planned",
 }
-"""Verdict -> its wording, in the order in which claims are shown."""
+"""Outcome of a claim -> its wording, in the order in which claims are shown."""
 
 COLUMNS = ("claim", "verdict", "difference", "measured", "scenes", "control")
-"""Columns of :attr:`JudgedClaim.row`."""
+"""Columns of :func:`claim_row`."""
 
 
-def claims_section(results: Results, judged: Sequence[JudgedClaim]) -> Section | None:
-    """The section on the claims that a study judges; None for a run without a verdict."""
-    own = [one for one in judged if one.verdict is not None]
-    if not own or len(results.study.scenes) < FEWEST_SCENES:
+def outcome(one: Comparison) -> str:
+    """Word for a claim, where "better" is what it expects."""
+    return {"better": "holds", "worse": "the opposite holds"}.get(one.word, one.word)
+
+
+def claim_verdict(one: Comparison) -> str:
+    """Verdict on a claim, without the reason."""
+    return outcome(one) if one.word in ("better", "worse") else one.verdict
+
+
+def means_in_words(one: Comparison) -> str:
+    """Means of both sides of a claim, that of b first."""
+    first, second = (in_words(mean, one.specification, one.metric) for mean in one.means)
+    return f"{second} against {first}"
+
+
+def claim_row(one: Comparison) -> list[str]:
+    """Cells of a table of claims; the control comes with its share of a gain."""
+    assert one.claim is not None
+    control, share = str(one.control.seen), one.control.share
+    if one.word in ("better", "worse", "blind") and share is not None and math.isfinite(share[0]):
+        control += f": {share_text(share)}"
+    verdict = ": ".join(filter(None, (claim_verdict(one), one.reason)))
+    scenes = str(one.contrast.scenes)
+    return [one.claim.text, verdict, one.difference, means_in_words(one), scenes, control]
+
+
+def claims_section(results: Results, claims: Sequence[Comparison]) -> Section | None:
+    """The section on the claims that a study judges; None for a run without any."""
+    if not claims or len(results.study.scenes) < FEWEST_SCENES:
         return None
-    kinds = list(OUTCOMES)
-    own.sort(key=lambda one: (kinds.index(str(one.verdict)), one.claim.headline or math.inf, one.p))
-    counts = Counter(str(one.verdict) for one in own)
+    kinds, several = list(OUTCOMES), len(claims) > 1
+
+    def order(one: Comparison) -> tuple[float, ...]:
+        return kinds.index(outcome(one)), (one.claim and one.claim.headline) or math.inf, one.p
+
+    counts = Counter(map(outcome, claims))
     counted = " ".join(f"{OUTCOMES[kind]}: {counts[kind]}." for kind in kinds if counts[kind])
-    several = len(own) > 1
     text = [
-        f"{len(own)} claim{'s are' if several else ' is'} judged. {counted}",
-        f"Of {results.study.sampled}, each test has those in which its difference is defined."
-        " Flipped signs of their differences decide"
-        + f", adjusted for all {len(own)} claims"
+        f"{len(claims)} claim{'s are' if several else ' is'} judged. {counted}",
+        f"Of {results.study.scenes_in_words}, each test has those in which its difference is"
+        " defined. Flipped signs of their differences decide"
+        + f", adjusted for all {len(claims)} claims"
         * several
         + ", and the interval is that of the test. **Control**: what has to do worse, such as"
         " features from a wrong place; in percent the share of the gain that it reaches too, from"
         ' a half on of which the claim is blind. "Can\'t tell" does not mean equal.',
     ]
-    rows = [list(one.row) for one in own]
+    rows = [claim_row(one) for one in sorted(claims, key=order)]
     return Section("Claims", text, [Table(list(COLUMNS), rows)])
-
-
-HERE = (
-    "**Here** speaks of these scenes alone: {here} **Views that agree** have the expected sign."
-    " **Measured** are means; those of two variants are over the views that both have. Errors"
-    " differ by a ratio, shares by their odds. One study judges each claim, on scenes that were"
-    " drawn; others show the same difference without a verdict."
-)
-
-MANY = (
-    "`seen`: the difference has the expected sign in every scene. `seen where defined`: in every"
-    " scene that has values. `not seen`: in no scene."
-)
-"""Meaning of the column for at least six scenes."""
-
-FEW = "how many have the sign of their mean. So few give no verdict."
-"""Meaning of the column for fewer scenes."""
-
-
-def claims_in_detail(results: Results, findings: Sequence[JudgedClaim]) -> list[Section]:
-    """The folded section on every claim that a run has measured; none without any."""
-    if not findings:
-        return []
-    judges = any(finding.judges for finding in findings)
-    rows, names = [], results.study.scene_names
-    few = len(names) < FEWEST_SCENES
-    for finding in findings:
-        if few:
-            unit = probe(finding.claim.probe).metric(finding.metric).unit
-            own = scene_texts(finding.contrast, unit, names)
-            below = finding.below_floor
-            own = [t + " (below)" * (n in below) for n, t in zip(names, own, strict=True)]
-        else:
-            own = [f"{finding.contrast.scenes} of {len(names)}", finding.difference]
-            if finding.below_floor:
-                own[0] += f"; below the floor: {', '.join(finding.below_floor)}"
-            if judges:
-                own += [number(finding.p), number(finding.contrast.student.p)]
-        here = no_verdict(finding.contrast) if few else finding.here
-        agree, views = finding.agreement
-        sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
-        rows.append([finding.claim.text, here, *own, f"{agree} of {views}", sides, finding.metric])
-    text = [HERE.format(here=FEW if few else MANY)]
-    if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
-        text.append(f"{BELOW_FLOOR} Scenes in which both sides are stand in the table.")
-    columns = ["scenes", "difference", *["adjusted p", "p by t"] * judges]
-    columns = names if few else columns
-    table = Table(["claim", "here", *columns, "views that agree", "measured", "metric"], rows)
-    return [Section("Claims in detail", text, [table], folded=True)]

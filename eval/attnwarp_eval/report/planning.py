@@ -14,12 +14,11 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.compared import between
-from attnwarp_eval.report.judging import count_of, found
+from attnwarp_eval.report.judging import count_of, measured
 from attnwarp_eval.statistics.contrasts import Contrast
 from attnwarp_eval.statistics.planning import scenes_needed
 from attnwarp_eval.statistics.scales import Scale
 from attnwarp_eval.statistics.signflips import FEWEST
-from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -64,9 +63,9 @@ def plan_scenes(results: Results) -> Table:
 
 
 def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
-    for one in found(results, load_claims()):
-        metric = probe(one.claim.probe).metric(one.metric)
-        yield one.claim.text, one.metric, metric, one.contrast
+    for one in measured(results, load_claims()):
+        assert one.claim is not None
+        yield one.claim.text, one.metric, one.specification, one.contrast
     for table in results.study.ablations:
         own = report_of(table.probe)
         for name in table.variants:

@@ -16,7 +16,15 @@ from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
 from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import difference_text, in_words
-from attnwarp_eval.report.judging import COLUMNS, JudgedClaim, decided, found
+from attnwarp_eval.report.judging import (
+    COLUMNS,
+    Comparison,
+    claim_row,
+    claim_verdict,
+    judged,
+    means_in_words,
+    measured,
+)
 from attnwarp_eval.report.raw import PARTS, read_raw, together
 from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import over_scenes, time_ratio
@@ -35,7 +43,8 @@ class Judged:
     """Claim with its verdict over all studies.
 
     Attributes:
-        judged: judged claim; None if its study has no raw results, or lacks a side.
+        comparison: its comparison with a word; None if its study has no raw results, or lacks a
+            side.
         time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
         by_answers: description of the difference for edits with several right answers and with one,
             if the study has both.
@@ -43,7 +52,7 @@ class Judged:
     """
 
     claim: Claim
-    judged: JudgedClaim | None = None
+    comparison: Comparison | None = None
     time: str = "–"
     report: Path | None = None
     by_answers: str = ""
@@ -69,23 +78,25 @@ def verdicts(folder: Path) -> list[Judged]:
                 " those of one run"
             )
         studies[name] = (*folders, together([results for _, results in own]))  # type: ignore[assignment]
-    judged = decided(
-        one
-        for _, results in studies.values()
-        for one in found(results, load_claims())
-        if one.judges
-    )
-    by_text = {one.claim.text: one for one in judged}
-    return [_judged(claim, by_text.get(claim.text), studies) for claim in load_claims()]
+    by_claim = {
+        one.claim.id: one
+        for one in judged(
+            one
+            for name, (_, results) in studies.items()
+            for one in measured(results, [c for c in load_claims() if c.study == name])
+        )
+        if one.claim is not None
+    }
+    return [_judged(claim, by_claim.get(claim.id), studies) for claim in load_claims()]
 
 
 def _judged(
-    claim: Claim, one: JudgedClaim | None, studies: Mapping[str, tuple[Path, Results]]
+    claim: Claim, one: Comparison | None, studies: Mapping[str, tuple[Path, Results]]
 ) -> Judged:
     if one is None:
         return Judged(claim)
     folder, results = studies[claim.study]
-    answers, context = _by_answers(results, one), _context(results, claim)
+    answers, context = _by_answers(results, one, claim), _context(results, claim)
     return Judged(claim, one, _time(results, one), folder, answers, context)
 
 
@@ -99,12 +110,12 @@ def _context(results: Results, claim: Claim) -> str:
     return FIGURE.sub(mean, claim.context)
 
 
-def _by_answers(results: Results, one: JudgedClaim) -> str:
-    if not probe(one.claim.probe).edits:
+def _by_answers(results: Results, one: Comparison, claim: Claim) -> str:
+    if not probe(one.probe).edits:
         return ""
     answers = {
         record.spec["edit"]["name"]: len(record.spec["edit"]["answers"])
-        for _, _, record in results.records(one.claim.probe, next(iter(one.sides)))
+        for _, _, record in results.records(one.probe, one.a)
         if "edit" in record.spec
     }
     if len(set(answers.values())) < 2:
@@ -114,77 +125,72 @@ def _by_answers(results: Results, one: JudgedClaim) -> str:
         a, b = (
             {
                 scene: {v: x for v, x in views.items() if (answers[v.split("/")[0]] > 1) == several}
-                for scene, views in side.items()
+                for scene, views in results.views(one.probe, who, one.metric, claim.yaw).items()
             }
-            for side in (one.measured.a, one.measured.b)
+            for who in (one.a, one.b)
         )
-        metric = probe(one.claim.probe).metric(one.metric)
-        found = replace(contrast(a, b, metric.scale), undefined=0)
-        if found.by_scene:
+        metric = one.specification
+        apart = replace(contrast(a, b, metric.scale), undefined=0)
+        if apart.by_scene:
             texts.append(
-                f"{difference_text(found, metric.unit)} over {found.scenes} scenes with {what}"
+                f"{difference_text(apart, metric.unit)} over {apart.scenes} scenes with {what}"
             )
     return ", ".join(texts) if len(texts) > 1 else ""
 
 
-def _time(results: Results, one: JudgedClaim) -> str:
-    timed = timed_in_turn(results, report_of(one.claim.probe).stage)
-    names = list(one.sides)
-    if timed is None or len(names) < 2:
+def _time(results: Results, one: Comparison) -> str:
+    timed, names = timed_in_turn(results, report_of(one.probe).stage), {one.a, one.b}
+    both = [turn for turn in timed.turns if names <= set(turn.names)] if timed else []
+    if timed is None or not both or len(names) < 2:
         return "–"
-    both = [turn for turn in timed.turns if set(names) <= set(turn.names)]
-    if not both:
-        return "–"
-    first, second = (Timed(both, timed.stage).rounds(name) for name in names)
+    first, second = (Timed(both, timed.stage).rounds(name) for name in (one.a, one.b))
     return ratio_text(time_ratio(second, first))
 
 
-def table(judged: list[Judged], beside: Path) -> Table:
+def table(claims: list[Judged], beside: Path) -> Table:
     """The table of all claims, with links relative to the folder ``beside``."""
     rows = []
-    for each in judged:
-        one = each.judged
+    for each in claims:
+        one = each.comparison
         if one is None or each.report is None:
             absent = f"not measured: `{each.claim.study}` judges it"
             rows.append([each.claim.text, absent, *["–"] * len(COLUMNS)])
             continue
         link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
-        claim, verdict, difference, *rest = one.row
+        claim, verdict, difference, *rest = claim_row(one)
         difference += f"; {each.by_answers}" * bool(each.by_answers)
         rows.append([claim, verdict, difference, *rest, each.time, f"[{each.claim.study}]({link})"])
     return Table([*COLUMNS, "time", "report"], rows)
 
 
-def headlines(judged: list[Judged]) -> list[str]:
+def headlines(claims: list[Judged]) -> list[str]:
     """Lines of the claims that README.md names, in their order; none if none was judged."""
     chosen = sorted(
-        (each for each in judged if each.claim.headline), key=lambda each: each.claim.headline
+        (each for each in claims if each.claim.headline), key=lambda each: each.claim.headline
     )
     lines = []
-    for number, each in enumerate((e for e in chosen if e.judged is not None), 1):
-        assert each.judged is not None
-        verdict, _, needed = each.judged.in_words.partition(": ")
-        needed = f" ({needed})" if needed else ""
-        told = (
-            each.by_answers or f"{_plainly(each.judged)}, over {each.judged.contrast.scenes} scenes"
-        )
+    for number, each in enumerate((e for e in chosen if e.comparison is not None), 1):
+        one = each.comparison
+        assert one is not None
+        verdict, reason = claim_verdict(one), f" ({one.reason})" if one.reason else ""
         text = each.claim.plain or each.claim.text
-        line = f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{needed}: {told}."
+        difference = each.by_answers or f"{_plainly(one)}, over {one.contrast.scenes} scenes"
+        line = f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{reason}: {difference}."
         lines.append(f"{line} {each.context}".strip())
     return lines
 
 
-def _plainly(one: JudgedClaim) -> str:
+def _plainly(one: Comparison) -> str:
     """Difference in plain words: shares side by side, errors in percent or as a factor."""
     factor, _, _ = one.contrast.shown()
     if one.contrast.scale != "ratio":
-        return one.means
+        return means_in_words(one)
     if factor > 2:
         return f"{rounded(factor, 2)} times the error"
     return f"{rounded(100 * abs(factor - 1), 2)} % {'less' if factor < 1 else 'more'} error"
 
 
-def filled(text: str, judged: list[Judged], beside: Path) -> str:
+def filled(text: str, claims: list[Judged], beside: Path) -> str:
     """Fill a document's marked places with the table and the lines; lines stay as they are while
     none of their claims has raw results.
 
@@ -193,8 +199,8 @@ def filled(text: str, judged: list[Judged], beside: Path) -> str:
         '<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n'
     """
     blocks = {
-        TABLE: markdown_table(table(judged, beside)).strip("\n"),
-        LINES: "\n".join(headlines(judged)),
+        TABLE: markdown_table(table(claims, beside)).strip("\n"),
+        LINES: "\n".join(headlines(claims)),
     }
     for mark, content in blocks.items():
         before, begun, rest = text.partition(_begin(mark))

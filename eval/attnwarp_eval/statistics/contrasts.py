@@ -14,7 +14,8 @@ from attnwarp_eval.statistics.planning import scenes_needed
 from attnwarp_eval.statistics.scales import FACTORS, Scale, compared
 from attnwarp_eval.statistics.signflips import FEWEST, SignFlips
 
-Verdict = Literal["better", "worse", "equal", "can't tell"]
+Verdict = Literal["better", "worse", "within", "equal", "can't tell"]
+"""Outcome of a test; "within": there is a difference, smaller than the bound of equality."""
 
 EQUAL_LEVEL = 0.9
 """Level of the interval for equality within a bound: two one-sided tests at 5 %."""
@@ -84,6 +85,8 @@ class Contrast:
     ) -> Verdict:
         """Verdict for the population of scenes.
 
+        Arms that are equal to the last digit were one computation: can't tell.
+
         Args:
             direction: which values are better.
             adjusted_p: the p-value adjusted for other tests; by default unadjusted.
@@ -91,10 +94,12 @@ class Contrast:
                 by default none.
         """
         p = self.flips.p if adjusted_p is None else adjusted_p
-        if self.scenes < FEWEST:
+        if self.scenes < FEWEST or not any(self.by_scene.values()):
             return "can't tell"
         if bound is not None and self._bounded.equal(bound, EQUAL_LEVEL):
-            return "equal"
+            low, high = self.flips.interval(EQUAL_LEVEL)
+            # A difference that the test has not told, and yet not 0, is none of the two.
+            return "within" if p <= 0.05 else "equal" if low <= 0 <= high else "can't tell"
         if not p <= 0.05:
             return "can't tell"
         return "better" if (self.flips.mean > 0) == (direction == "higher") else "worse"

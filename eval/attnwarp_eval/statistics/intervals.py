@@ -257,29 +257,6 @@ def _bounds_of_median(values: npt.NDArray[np.float64]) -> tuple[float, float]:
     return float(ordered[left_out]), float(ordered[-1 - left_out])
 
 
-def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
-    """Number of shared views in which b - a has the given sign: (those, all).
-
-    A statement about these scenes only. A difference within the rounding
-    of the values (:data:`ROUNDING`) has no sign.
-
-    Example:
-        >>> a = {"bear": {"yaw010": 1.0, "yaw020": 1.0}}
-        >>> agreement(a, {"bear": {"yaw010": 2.0, "yaw020": 0.5}}, sign=1)
-        (1, 2)
-    """
-    pairs = [
-        (a[scene][view], b[scene][view])
-        for scene in a
-        if scene in b
-        for view in a[scene]
-        if view in b[scene]
-    ]
-    defined = [pair for pair in pairs if np.isfinite(pair).all()]
-    rounding = ROUNDING * max((abs(value) for pair in defined for value in pair), default=0.0)
-    return sum((after - before) * sign > rounding for before, after in defined), len(defined)
-
-
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:
     """p-values adjusted for the false discovery rate (Benjamini & Hochberg 1995); NaN stays NaN and
     does not count.

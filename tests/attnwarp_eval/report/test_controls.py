@@ -1,11 +1,15 @@
 """Oracle: figures written by hand, which a control moves or does not."""
 
+import itertools
 import re
 
+import numpy as np
+import pytest
 import written_runs
 
 from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.build import build
+from attnwarp_eval.report.controls import control_share, share_text
 
 SCENES = [f"scene{k}" for k in range(8)]
 STUDY = {
@@ -85,3 +89,27 @@ def test_without_controls_nothing_is_blind(tmp_path):
     variants = {name: STUDY["variants"][name] for name in ("full", "half")}
     study = {**STUDY, "variants": variants, "probes": {"ideal": ["full", "half"]}}
     assert "| can't tell |" in row(report(tmp_path, 0.8, study))
+
+
+@pytest.mark.parametrize("weakest", [-0.2, -0.5])
+def test_a_draw_without_a_gain_bounds_the_share_of_a_control_on_neither_side(weakest):
+    """Oracle: all 46,656 draws of six scenes. Of those without a gain, no share of it is known."""
+    gains = np.array([1.0, 0.9, 0.3, 0.2, 0.1, weakest])
+    reached = np.array([0.3, 0.1, 0.2, 0.1, -0.1, 0.1])
+    tables = [
+        {f"s{k}": {"v": value} for k, value in enumerate(side)}
+        for side in (gains, reached, np.zeros(6))
+    ]
+    drawn = np.array(list(itertools.product(range(6), repeat=6)))
+    gain, part = gains[drawn].sum(axis=1), reached[drawn].sum(axis=1)
+    mean, low, high = control_share(*tables)
+    lost = (gain <= 0).mean()
+    assert mean == pytest.approx(reached.sum() / gains.sum())
+    if lost >= 0.025:
+        assert (low, high) == (-np.inf, np.inf)
+        assert share_text((mean, low, high)).endswith(" % (no bounds)")
+        return
+    known = part[gain > 0] / gain[gain > 0]
+    # Of 1,000 draws, 25 lie beyond an end; three standard errors are 15.
+    for beyond in ((known < low).sum(), (known > high).sum()):
+        assert (beyond / len(drawn) + lost) == pytest.approx(0.025, abs=0.015)

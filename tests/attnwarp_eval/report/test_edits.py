@@ -27,7 +27,7 @@ def planted():
 def test_edits_of_opposite_signs_are_not_pooled():
     results = planted()
     compared = compared_of(results, [])
-    told = [[row.verdict for row in rows if row.metric == "labels.right"] for rows in compared]
+    told = [[one.word for one in rows if one.metric == "labels.right"] for rows in compared]
     assert told == [["better"], ["worse"]]
     (section,) = differences(results, compared)
     assert [table.caption for table in section.tables] == ["b: one", "b: several"]

@@ -21,11 +21,12 @@ from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.judging import (
-    claims_in_detail,
+    claim_row,
     claims_section,
-    decided,
-    found,
     judge,
+    judged,
+    measured,
+    outcome,
 )
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
@@ -212,7 +213,7 @@ def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_pa
     rows = {row[1]: row for row in section.tables[-1].rows}
     # One claim, so its p-value is not multiplied; with the table's two others it would be by 3/1.
     assert rows[SLIP][5] == f"{number(p[SLIP])} †" == f"{number(claim.p)} †"
-    assert (rows[SLIP][3], claim.verdict) == ("worse", "holds")
+    assert (rows[SLIP][3], outcome(claim)) == ("worse", "holds")
     # The smaller of the table's two tests is doubled, the larger stays.
     assert p[recall] < p[precision]
     assert rows[recall][5] == number(2 * p[recall])
@@ -243,37 +244,71 @@ def test_differences_that_vanish_in_every_view_are_called_the_same_values_and_ne
     assert row[3] == "same values"
 
 
-def test_a_claim_is_seen_here_and_only_its_own_study_gives_a_verdict_on_scenes_that_were_drawn():
-    (finding,) = judge(results(CLEAR), [SLIP_CLAIM])
-    assert (finding.here, finding.verdict, finding.agreement) == ("seen", None, (6, 6))
-    assert finding.in_words == "judged by `hand-made`"
-    assert finding.metric == SLIP
-    assert set(finding.sides) == {"good", "slipped"}
+def test_only_its_own_study_judges_a_claim_and_the_expected_direction_holds():
     clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
     (told,) = judge(drawn(clear), [SLIP_CLAIM])
-    assert (told.here, told.verdict, told.p) == ("seen", "holds", 2 / 2**8)
-    (elsewhere,) = judge(drawn(clear, name="other"), [SLIP_CLAIM])
-    assert (elsewhere.here, elsewhere.verdict) == ("seen", None)
-    assert elsewhere.difference == told.difference
+    assert (outcome(told), told.p, told.metric) == ("holds", 2 / 2**8, SLIP)
+    assert (told.a, told.b) == ("good", "slipped")
+    assert judge(drawn(clear, name="other"), [SLIP_CLAIM]) == []
     (opposite,) = judge(drawn(clear), [dataclasses.replace(SLIP_CLAIM, expect="lower")])
-    assert opposite.verdict == "the opposite holds"
+    assert outcome(opposite) == "the opposite holds"
+
+
+PLAN = {"drawn": 8, "seed": 7, "size": 512}
 
 
 @pytest.mark.parametrize(
-    ("factor", "metric", "within", "verdict"),
+    ("plan", "changes", "undone"),
     [
-        (1.04, SLIP, "5 %", "equal"),
-        (1.04, SLIP, "3 %", "holds"),
-        (1.04, SLIP, None, "holds"),
-        (1.04, "occlusion.recall", "1 %", "equal"),  # 0.1 to 0.104: 0.4 points
+        ({"drawn": 9}, {}, 0),  # a scene more was planned
+        ({"size": 256}, {}, 0),
+        ({"seed": 8}, {}, 0),
+        ({"seeds": [0, 1]}, {}, 0),
+        ({}, {"scenes": list(DRAWN)}, 0),  # scenes of these names, not drawn
+        ({}, {}, 1),  # a run that stopped
     ],
 )
-def test_a_difference_within_the_bound_is_equal_in_percent_of_an_error_and_points_of_a_share(
-    factor, metric, within, verdict
+def test_a_claim_on_less_than_was_planned_is_not_finished_and_adjusts_no_other(
+    plan, changes, undone
+):
+    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
+    whole = drawn(clear)
+    claim = dataclasses.replace(SLIP_CLAIM, scenes=PLAN)
+    assert [outcome(one) for one in judge(whole, [claim])] == ["holds"]
+    run = written_runs.results(study(**changes), whole.cells) if changes else whole
+    cells = [dataclasses.replace(cell, record=None) for cell in run.cells[:undone]]
+    run = dataclasses.replace(run, cells=cells + run.cells[undone:])
+    less = dataclasses.replace(SLIP_CLAIM, scenes={**PLAN, **plan})
+    (told,) = judge(run, [less])
+    assert told.verdict == "not finished"
+    assert claims_section(run, [told]).tables[0].rows[0][1] == "not finished"
+    both = judged([*measured(run, [less]), *measured(whole, [claim])])
+    assert [one.p for one in both][1] == 2 / 2**8
+
+
+@pytest.mark.parametrize(
+    ("factors", "metric", "within", "verdict"),
+    [
+        # Of one sign in all scenes, so sure: p is 2 / 256.
+        ([1.04] * 8, SLIP, "5 %", "more, by less than 5 %"),
+        ([0.96] * 8, SLIP, "5 %", "less, by less than 5 %"),
+        ([1.04] * 8, SLIP, "3 %", "better"),
+        ([1.04] * 8, SLIP, None, "better"),
+        # 0.1 to 0.104 is 0.4 points.
+        ([1.04] * 8, "occlusion.recall", "1 %", "more, by less than 1 point"),
+        # Of either sign in as many scenes: p is 1, and the interval holds 0.
+        ([1.02, 0.98] * 4, SLIP, "5 %", "equal within 5 %"),
+        ([1.02, 0.98] * 4, "occlusion.recall", "1 %", "equal within 1 point"),
+        # Of one sign in seven of eight: p is 18 / 256, and the interval at 90 % lacks 0.
+        ([1.02] * 7 + [0.98], SLIP, "5 %", "can't tell"),
+    ],
+)
+def test_only_a_difference_that_may_be_none_is_equal_and_a_sure_one_is_less_than_the_bound(
+    factors, metric, within, verdict
 ):
     cells = [
         cell(who, scene, [("v0", 0.0, {metric: value})])
-        for scene in DRAWN
+        for scene, factor in zip(DRAWN, factors, strict=True)
         for who, value in (("good", 0.1), ("slipped", 0.1 * factor))
     ]
     run = written_runs.results(study(scenes={"drawn": 8, "seed": 7}), cells)
@@ -296,7 +331,7 @@ def test_a_claim_whose_control_does_no_worse_than_its_last_side_is_blind(factor,
     run = drawn(table, variants=variants, probes={"warp": list(variants)})
     claim = dataclasses.replace(SLIP_CLAIM, control={"worse": variants["wrong"]})
     (finding,) = judge(run, [claim])
-    assert (finding.measured.control, finding.verdict) == (control, verdict)
+    assert (finding.control.seen, outcome(finding)) == (control, verdict)
 
 
 @pytest.mark.parametrize(("control", "verdict"), [(0.8, "holds"), (0.5, "blind")])
@@ -313,10 +348,10 @@ def test_a_control_that_reaches_more_than_half_of_a_gain_is_seen_and_the_claim_b
     )
     (finding,) = judge(run, [claim])
     share = (0.9 - control) / (0.9 - 0.3)
-    assert finding.measured.share == pytest.approx([share] * 3)
-    assert (finding.measured.control, finding.verdict) == ("seen", verdict)
+    assert finding.control.share == pytest.approx([share] * 3)
+    assert (finding.control.seen, outcome(finding)) == ("seen", verdict)
     text = number(100 * share, 2)
-    assert finding.control == finding.row[-1] == f"seen: {text} % ({text} to {text} %)"
+    assert claim_row(finding)[-1] == f"seen: {text} % ({text} to {text} %)"
 
 
 @pytest.mark.parametrize(
@@ -330,23 +365,17 @@ def test_wrong_features_that_do_as_well_explain_no_loss(expected, verdict):
     run = drawn(table, variants=variants, probes={"warp": list(variants)})
     claim = dataclasses.replace(SLIP_CLAIM, control={expected: variants["wrong"]})
     (finding,) = judge(run, [claim])
-    assert (finding.measured.control, finding.verdict) == ("not seen", verdict)
+    assert (finding.control.seen, outcome(finding)) == ("not seen", verdict)
 
 
-def test_p_values_are_adjusted_over_the_claims_of_all_studies_that_judge_and_no_others():
+def test_p_values_are_adjusted_over_the_claims_of_all_studies():
     """Oracle: Benjamini and Hochberg by hand: 4 / 256 of one, and 2 / 256 of another, of two."""
     clear = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]
     nearly = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.09]
-    runs = [
-        drawn({"good": [[0.1] * 8], "slipped": [row]}, name=name)
-        for name, row in (("hand-made", clear), ("other", nearly), ("third", clear))
-    ]
-    claims = [SLIP_CLAIM, dataclasses.replace(SLIP_CLAIM, study="other")]
-    both = [one for run in runs for one in found(run, claims)]
-    raw = [one.p for one in both if one.judges]
-    assert raw == [2 / 256, 4 / 256]
-    assert [one.p for one in decided(both) if one.judges] == [4 / 256, 4 / 256]
-    assert sum(one.verdict is None for one in decided(both)) == 4
+    runs = [drawn({"good": [[0.1] * 8], "slipped": [row]}) for row in (clear, nearly)]
+    both = [one for run in runs for one in measured(run, [SLIP_CLAIM])]
+    assert [one.contrast.flips.p for one in both] == [2 / 256, 4 / 256]
+    assert [one.p for one in judged(both)] == [4 / 256, 4 / 256]
 
 
 @pytest.mark.parametrize(("count", "verdict"), [(8, "holds"), (5, "can't tell")])
@@ -365,7 +394,7 @@ def test_of_a_population_flipped_signs_decide_on_the_metrics_scale(count, verdic
     logs = np.log1p(gains)
     signs = np.array(list(itertools.product([1, -1], repeat=count)))
     expected = (np.abs(signs @ logs) >= logs.sum() - 1e-9).mean()
-    assert finding.p == pytest.approx(expected) and finding.verdict == verdict
+    assert finding.p == pytest.approx(expected) and outcome(finding) == verdict
     assert finding.contrast.student.p == pytest.approx(stats.ttest_1samp(logs, 0).pvalue)
     assert finding.contrast.shown()[0] == pytest.approx(np.exp(logs.mean()))
 
@@ -374,32 +403,26 @@ def test_a_claim_finds_its_sides_by_content_and_not_by_name():
     renamed = results(
         CLEAR, variants={"good": {"set": {"pixel_centers": "integer"}}, "slipped": {}}
     )
-    (finding,) = judge(renamed, [SLIP_CLAIM])
+    (finding,) = measured(renamed, [SLIP_CLAIM])
     # The variant called "good" is the slipped one here, so the difference turns round.
-    (named,) = judge(results(CLEAR), [SLIP_CLAIM])
+    (named,) = measured(results(CLEAR), [SLIP_CLAIM])
+    assert (finding.a, finding.b) == ("slipped", "good")
     assert finding.contrast.flips.mean == pytest.approx(-named.contrast.flips.mean)
-    assert finding.here == "not seen"
-    assert (
-        judge(
-            results(
-                {"good": CLEAR["good"]},
-                variants={"good": {}},
-                probes={"warp": ["good"]},
-                ablations=[],
-            ),
-            [SLIP_CLAIM],
-        )
-        == []
-    )
+    one = {"variants": {"good": {}}, "probes": {"warp": ["good"]}, "ablations": []}
+    assert measured(results({"good": CLEAR["good"]}, **one), [SLIP_CLAIM]) == []
 
 
-def test_a_claim_that_only_some_scenes_show_is_mixed_and_says_how_many_scenes_would_tell():
+def needed(finding):
+    verdict, reason = claim_row(finding)[1].split(": ")
+    assert verdict == "can't tell"
+    return int(re.fullmatch(r"(\d+) scenes would", reason)[1])
+
+
+def test_a_claim_that_cannot_be_told_says_how_many_scenes_would():
     (finding,) = judge(drawn(HALF_TOLD), [SLIP_CLAIM])
-    agree = (int((UNSURE > 1).sum()), 8)
-    assert (finding.here, finding.verdict, finding.agreement) == ("mixed", "can't tell", agree)
-    needed = int(re.fullmatch(r"can't tell: (\d+) scenes would", finding.in_words)[1])
+    count = needed(finding)
     effect = np.log(UNSURE).mean() / np.log(UNSURE).std(ddof=1)
-    assert power(needed, effect) >= 0.8 > power(needed - 1, effect)
+    assert power(count, effect) >= 0.8 > power(count - 1, effect)
 
 
 def test_more_scenes_are_needed_where_more_claims_are_told_apart():
@@ -407,9 +430,9 @@ def test_more_scenes_are_needed_where_more_claims_are_told_apart():
     (finding,) = judge(drawn(HALF_TOLD), [SLIP_CLAIM])
     adjusted = dataclasses.replace(finding, p=min(1.0, 4 * finding.p))
     level = 1 - 0.05 * finding.p / adjusted.p
-    needed = int(re.fullmatch(r"can't tell: (\d+) scenes would", adjusted.in_words)[1])
+    count = needed(adjusted)
     effect = np.log(UNSURE).mean() / np.log(UNSURE).std(ddof=1)
-    assert power(needed, effect, level) >= 0.8 > power(needed - 1, effect, level)
+    assert power(count, effect, level) >= 0.8 > power(count - 1, effect, level)
 
 
 METHODS = {"alone": {"options": {"a0": 0.0}}, "mine": {"options": {"iterations": 5}}}
@@ -426,34 +449,6 @@ def edited(
         **extra.to_json(),
     )
     return written_runs.outcome("editing", scene, [name], data, f"{name}-{scene}")
-
-
-def test_a_claim_names_the_scenes_in_which_both_sides_are_below_the_floor_and_says_what_it_means():
-    metric = "multiview.delta_e_above.edit_inside"
-    values = {
-        "alone": {"one": -1.0, "two": 2.0, "three": 4.0},
-        "mine": {"one": -2.0, "two": -1.0, "three": 1.0},
-    }
-    cells = [
-        edited(name, value, metric=metric, scene=scene)
-        for name, own in values.items()
-        for scene, value in own.items()
-    ]
-    names = {name: METHODS[name] for name in values}
-    run = written_runs.results(
-        study(variants=names, probes={"editing": list(names)}, ablations=[]), cells
-    )
-    claim = dataclasses.replace(
-        SLIP_CLAIM,
-        probe="editing",
-        metric=metric,
-        a=METHODS["alone"],
-        b=METHODS["mine"],
-        expect="lower",
-    )
-    (finding,) = judge(run, [claim])
-    # In scene two only one side is.
-    assert (finding.here, finding.below_floor) == ("seen", ("one",))
 
 
 def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():
@@ -541,31 +536,7 @@ def test_lines_of_the_readme_are_numbered_from_one_and_at_most_five():
 @pytest.mark.parametrize("name", sorted({claim.study for claim in load_claims()}))
 def test_a_judging_study_draws_the_scenes_that_its_claims_declare(name):
     for claim in load_claims():
-        assert claim.judged_by(shipped(name)) == (claim.study == name)
-
-
-def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_scene(slip_declared):
-    (finding,) = judge(
-        results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM]
-    )
-    here = "seen where defined"
-    assert (finding.here, finding.agreement, finding.contrast.scenes) == (here, (2, 2), 2)
-    missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
-    assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
-    judged = judge(missing, load_claims())
-    assert claims_section(missing, judged) is None
-    (table,) = claims_in_detail(missing, judged)[0].tables
-    # Fewer than six scenes stand side by side.
-    assert table.columns[:5] == ["claim", "here", *SCENES]
-    assert not {"difference", "scenes"} & set(table.columns)
-    for row in table.rows:
-        # 0.6 and 0.7 px against 0.1 px; nothing of scene two.
-        assert row[2:5] == ["× 6.00", "–", "× 7.00"]
-    (finding,) = judge(
-        results({"good": [[0.9], [None], [0.9]], "slipped": [[0.6]] * 3}), [SLIP_CLAIM]
-    )
-    assert finding.here == "not seen"
-    assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
+        assert claim.study != name or claim.planned(shipped(name))
 
 
 def test_the_means_beside_a_claims_difference_are_over_the_views_that_both_sides_have():
@@ -575,10 +546,9 @@ def test_the_means_beside_a_claims_difference_are_over_the_views_that_both_sides
             "slipped": [[0.6, None], [0.5, 0.7], [None, None]],
         }
     )
-    (finding,) = judge(run, [SLIP_CLAIM])
+    (finding,) = measured(run, [SLIP_CLAIM])
     # Scene one without its second view, two whole, three left out; 9.0 would turn the order round.
-    means = {name: side.mean for name, side in finding.sides.items()}
-    assert means == pytest.approx({"good": (0.1 + 0.2) / 2, "slipped": (0.6 + 0.6) / 2})
+    assert finding.means == pytest.approx(((0.1 + 0.2) / 2, (0.6 + 0.6) / 2))
 
 
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
@@ -761,11 +731,11 @@ def test_a_front_of_a_figure_that_no_view_has_says_so(tmp_path):
     assert not section.tables and not section.figures
 
 
-def test_rounding_is_not_seen():
+def test_rounding_is_no_difference():
     """Differences of 5.6e-17 in every scene: the same values, as the p-value says."""
     table = {"good": [[0.3, 0.3]] * 3, "slipped": [[0.1 + 0.2, 0.1 + 0.2]] * 3}
-    (claim,) = judge(results(table), [SLIP_CLAIM])
-    assert (claim.here, claim.contrast.flips.p, claim.agreement) == ("not seen", 1.0, (0, 6))
+    (claim,) = measured(results(table), [SLIP_CLAIM])
+    assert claim.contrast.flips.p == 1.0
 
 
 def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):

@@ -19,7 +19,7 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
 from attnwarp_eval.report.claims import load_claims
-from attnwarp_eval.report.judging import decided, found, judge
+from attnwarp_eval.report.judging import claim_row, judge, judged, measured
 from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
@@ -161,20 +161,20 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
         store = written(tmp_path / f"run{k}", SCENES[half], factors[half], rounds=7)
         target = reports / "suite" / f"results-{k}.jsonl.xz"
         assert invoke("report", store.root, "--raw", target, "--no-pictures").exit_code == 0
-    judged = verdicts(reports)
-    (slip,) = [one for one in judged if one.judged is not None]
+    claims = verdicts(reports)
+    (slip,) = [one for one in claims if one.comparison is not None]
     assert slip.claim.id == "half-pixel-slip"
-    assert slip.judged.p == pytest.approx(stats.binomtest(8, 8).pvalue)
-    made = table(judged, tmp_path)
-    (cells,) = [row for row in made.rows if row[-1] != "–"]
-    row = dict(zip(made.columns, cells, strict=True))
+    assert slip.comparison.p == pytest.approx(stats.binomtest(8, 8).pvalue)
+    whole = table(claims, tmp_path)
+    (cells,) = [row for row in whole.rows if row[-1] != "–"]
+    row = dict(zip(whole.columns, cells, strict=True))
     assert row["verdict"] == "holds" and row["scenes"] == "8"
     assert row["difference"].startswith(f"× {np.exp(np.log(factors).mean()):.2f} (")
     assert row["time"] == "2.00 [2.00, 2.00]"
     assert row["report"] == "[suite](reports/suite/report.md)"
     mean = 0.1 * factors.mean()
     assert row["measured"] == f"{mean:.2f} px of a 64 grid against 0.10 px of a 64 grid"
-    (line,) = headlines(judged)
+    (line,) = headlines(claims)
     # With factors from 1.6 to 3.3 the mean of the logarithms is 0.85.
     assert line.endswith("Holds: 2.3 times the error, over 8 scenes.")
     document = tmp_path / "README.md"
@@ -183,12 +183,12 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     text = document.read_text()
     assert text.startswith("a\n<!-- verdicts -->\n") and text.endswith("<!-- /verdicts -->\nb\n")
     assert "| holds |" in text and "\nold\n" not in text
-    assert text == filled(text, judged, tmp_path)
+    assert text == filled(text, claims, tmp_path)
 
 
 def test_sides_that_are_equal_to_the_last_digit_were_not_tried(tmp_path, slip_declared):
     (one,) = judge(read_results(written(tmp_path / "run", SCENES, [1.0] * 8)), load_claims())
-    assert one.in_words == "can't tell: both sides are equal to the last digit"
+    assert claim_row(one)[1] == "can't tell: both sides are equal to the last digit"
 
 
 def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
@@ -257,12 +257,14 @@ def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict
             scenes = whole.study.scene_names[odd::2]
             study = whole.study.model_copy(update={"scenes": whole.study.scenes[odd::2]})
             own = [cell for cell in whole.cells if cell.scene in scenes]
-            one += found(dataclasses.replace(whole, study=study, cells=own), load_claims())
-        judged = decided(each for each in one if each.judges)
-        halves.append({each.claim.text: each.verdict for each in judged})
+            claims = [c for c in load_claims() if c.study == study.name]
+            one += measured(dataclasses.replace(whole, study=study, cells=own), claims)
+        # Half of the planned scenes is not finished.
+        every = judged(dataclasses.replace(each, word="") for each in one)
+        halves.append({each.claim.text: each.word for each in every})
     assert halves[0].keys() == halves[1].keys() and len(halves[0]) > 10
-    opposite = {"holds", "the opposite holds"}
-    pairs = {text: {verdict, halves[1][text]} for text, verdict in halves[0].items()}
+    opposite = {"better", "worse"}
+    pairs = {text: {word, halves[1][text]} for text, word in halves[0].items()}
     assert [text for text, pair in pairs.items() if pair == opposite] == []
     agreeing = [text for text, pair in pairs.items() if len(pair & opposite) == len(pair) == 1]
     assert len(agreeing) > 3  # the halves do tell
@@ -281,21 +283,20 @@ def test_of_200_simulated_runs_of_equal_arms_few_judge_and_no_interval_disagrees
 ):
     """Five claims a run, on the odds of shares: adjusted together, one in twenty runs may tell."""
     store = written(tmp_path / "run", SCENES, [1.0] * 8)
-    (one,) = [c for c in found(read_results(store), load_claims()) if c.judges]
+    (one,) = measured(read_results(store), load_claims())
     rng, told = np.random.default_rng(4), 0
     for _ in range(200):
-        judged = []
+        family = []
         for _ in range(5):
             k = rng.binomial(40, np.clip(rng.normal(0.5, 0.2, 12), 0.05, 0.95), (2, 12))
             a, b = ({f"s{i}": {"v": x / 40} for i, x in enumerate(side)} for side in k)
             of = {f"s{i}": {"v": 40} for i in range(12)}
             value = contrast(a, b, "share", counts=(of, of))
-            measured = dataclasses.replace(one.measured, contrast=value)
             claim = dataclasses.replace(one.claim, equal_within=None)
-            judged.append(dataclasses.replace(one, claim=claim, measured=measured, p=value.flips.p))
-        every = decided(judged)
+            family.append(dataclasses.replace(one, claim=claim, contrast=value))
+        every = judged(family)
         for each in every:
             _, low, high = each.contrast.shown(each.contrast.level(each.p))
-            assert each.told == (not low <= 1 <= high)
-        told += any(each.told for each in every)
+            assert (each.word != "can't tell") == (not low <= 1 <= high)
+        told += any(each.word != "can't tell" for each in every)
     assert told <= stats.binom.ppf(0.999, 200, 0.05)

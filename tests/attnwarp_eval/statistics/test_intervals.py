@@ -8,7 +8,6 @@ import pytest
 from scipy import stats
 
 from attnwarp_eval.statistics.intervals import (
-    agreement,
     benjamini_hochberg,
     common,
     front,
@@ -202,16 +201,6 @@ def test_an_adjusted_p_value_silences_a_verdict():
     clear = interval({f"s{i}": [1.0 + 0.01 * i] for i in range(4)})
     assert verdict(clear, "higher", adjusted_p=0.04) == "better"
     assert verdict(clear, "higher", adjusted_p=0.06) == "can't tell"
-
-
-def test_agreement_counts_the_views_that_show_the_sign():
-    a = {"s": {"v": 1.0, "w": 2.0, "x": np.nan}, "t": {"v": 0.0}}
-    b = {"s": {"v": 2.0, "w": 1.0, "x": 1.0}, "t": {"v": 3.0, "y": 1.0}}
-    assert agreement(a, b, +1) == (2, 3)
-    assert agreement(a, b, -1) == (1, 3)
-    # Sums in another order are no sign.
-    rounded = {"bear": {"v": 0.1 + 0.2, "w": 0.3}}
-    assert agreement({"bear": {"v": 0.3, "w": 0.1 + 0.2}}, rounded, +1) == (0, 2)
 
 
 def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
