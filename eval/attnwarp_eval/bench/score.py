@@ -6,7 +6,8 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from attnwarp.colors import ciede2000, to_lab
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.io.file import inside
-from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.bench import warps
@@ -33,8 +33,8 @@ from attnwarp_eval.bench.result import (
     mean,
     table,
 )
-from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
-from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.bench.suite import Suite, sha256, to_bytes, truth_file
+from attnwarp_eval.canonical_json import read_as, without_nan
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.cost import source_hash
 from attnwarp_eval.document.model import Grid, Picture, Report, Section, Table
@@ -62,6 +62,14 @@ SHOWN_SCENES, SHOWN_VIEWS = 3, 5
 
 UNEDITED, COPIED, SMOOTHED = "the source is unedited", "copies of the source", "smooth"
 """Beginnings of remarks on pictures that agree without merit."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A finished edit's score, and a hash of all that decides it."""
+
+    key: str
+    score: Score
 
 
 def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> Result:
@@ -100,15 +108,17 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> Re
         report.step(number, len(given), f"{scene}, {edit}")
         kept = out / "scores" / f"{scene}-{edit}.json"
         digest = _digest(truth_file(suite, scene), bench.spp, folder, told.track)
-        stored = json.loads(read_text(kept)) if kept.is_file() else {}
-        if stored.get("key") != digest:
+        stored = None
+        with suppress(InputError):  # missing or damaged
+            stored = read_as(_Kept, kept, "")
+        if stored is None or stored.key != digest:
             if told.track == WARPS:
                 made = warps.score(bench, suite, scene, folder)
             else:
                 made = _score(bench, suite, scene, edit, folder, told.track)
-            stored = {"key": digest, "score": without_nan(asdict(made))}
-            write_atomic(kept, json.dumps(stored).encode())
-        scores.append(Score(**stored["score"]))
+            stored = _Kept(digest, made)
+            write_atomic(kept, json.dumps(without_nan(asdict(stored))).encode())
+        scores.append(stored.score)
     missing = ["/".join(pair) for pair in folders if pair not in given]
     result = Result(
         protocol=PROTOCOL, bench=bench.identity(), method=told, scores=scores, missing=missing
@@ -265,8 +275,8 @@ def _power(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
 def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
     held = (path for path in folder.iterdir() if path.suffix in (".png", ".ply", ".npz"))
     files = sorted(inside(folder, path.name) for path in held)
-    parts = [str(PROTOCOL), track, read_text(truth), str(spp), source_hash()]
-    parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
+    parts = [str(PROTOCOL), track, sha256(truth), str(spp), source_hash()]
+    parts += [f"{path.name}:{sha256(path)}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 

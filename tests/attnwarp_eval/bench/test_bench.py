@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -160,14 +161,19 @@ def test_scores_equal_those_of_a_study_to_the_last_digit(bench, tmp_path):
             np.testing.assert_equal(value, view.metrics[name])
 
 
-def test_scores_of_other_code_are_measured_again(bench, tmp_path, monkeypatch):
+def test_scores_of_other_code_and_damaged_ones_are_measured_again(bench, tmp_path, monkeypatch):
     pictures, measured, measure = true_pictures(bench, "colour", ["edited"] * 3), [], score._score
     monkeypatch.setattr(score, "_score", lambda *given: measured.append(1) or measure(*given))
     for source, times in (("one", 1), ("one", 1), ("two", 2)):
         for module in (cost, score):
             monkeypatch.setattr(module, "source_hash", lambda source=source: source, raising=False)
-        scored(bench, tmp_path, pictures, "colour")
+        one = scored(bench, tmp_path, pictures, "colour")
         assert len(measured) == times
+    kept = tmp_path / "out" / "scores" / f"{SCENE}-colour.json"
+    for text in (kept.read_text()[:99], '{"key": 1}', "\x92"):
+        kept.write_bytes(text.encode("latin-1"))
+        np.testing.assert_equal(asdict(scored(bench, tmp_path, pictures, "colour")), asdict(one))
+    assert len(measured) == times + 3
 
 
 def test_true_pictures_of_one_answer_have_no_error(bench, tmp_path):
