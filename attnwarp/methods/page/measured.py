@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from functools import partial
-from itertools import groupby, permutations
+from itertools import permutations
 from types import MappingProxyType
 from typing import Any
 
@@ -17,24 +16,39 @@ from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
 from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
+from attnwarp.io import read_ply
 from attnwarp.io.names import file_stems
 from attnwarp.methods.attention_warping import AttentionWarping
-from attnwarp.methods.base import ViewEdit
+from attnwarp.methods.base import Edit, edit_file
 from attnwarp.methods.by_view import ByView
+from attnwarp.methods.dge import DGE
+from attnwarp.methods.gaussctrl import GaussCtrl
+from attnwarp.methods.guided import Guided
+from attnwarp.methods.igs2gs import IGS2GS
 from attnwarp.methods.pictures import Bytes, Segment, to_bytes
 from attnwarp.methods.scene import near_of
-from attnwarp.methods.settings import (
-    AttentionWarpingSettings,
-    ByViewSettings,
-    MethodSettings,
-)
-from attnwarp.methods.work import Work, chunks
+from attnwarp.methods.settings import PRESETS, ByViewSettings
+from attnwarp.methods.tuning import Order
+from attnwarp.methods.view_edits import RecordedSource
+from attnwarp.methods.work import Work
 from attnwarp.reporting import Reporter
 from attnwarp.warp import preset, render_surface, sample_at, warp_surfaces
 from attnwarp.workdir import MANIFEST, Workdir
 
 CONTROL = "control"
 """Folder of the views edited alone."""
+
+
+NOTHING_CARRIED: dict[str, dict[str, Any]] = {
+    "attention_warping": {"a0": 0.0, "unseen": "free", "reference": "none"},
+    "dge": {"plain_below": 1000},
+    "gaussctrl": {"self_share": 1.0, "control_share": None},
+    "guided": {"below": 0},
+    "igs2gs": {},
+}
+"""Settings with which a view's edit takes nothing from another view's, by the method's name. Other
+methods' controls are :func:`attnwarp.methods.by_view`'s edits.
+"""
 
 
 def edited_alone(
@@ -46,7 +60,8 @@ def edited_alone(
     views: Sequence[int],
     report: Reporter,
 ) -> None:
-    """Edit each view alone, with the run's noise and all else equal, into a run's folder.
+    """Edit each view alone into a run's folder, with all else as in the view's last edit: its
+    noise, start, steps, guidance and splats.
 
     Args:
         views: numbers of the views; views already in the folder are kept.
@@ -54,39 +69,79 @@ def edited_alone(
     manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
     (folder.path / CONTROL).mkdir(parents=True, exist_ok=True)
     files = {view: f"{CONTROL}/{names[view]}.png" for view in views}
+    source, name = manifest.get("source"), manifest["method"]
+    shown = {names[view]: view for view in views}
+    if source in shown and name in ("attention_warping", "warped_reference"):
+        # It takes nothing from another view, and may have been made elsewhere.
+        picture = folder.read_picture(f"views/{source}.png")
+        folder.write_picture(files[shown[source]], picture)
     left = [view for view in views if not folder.has(files[view])]
     if not left:
         return
-
-    def work_with(settings: MethodSettings) -> Work:
-        instruction = manifest["instruction"]
-        return Work(
-            gaussians, scene, editor, instruction, settings, "auto", folder, report, segments
-        )
-
-    edits: list[tuple[Sequence[int], Callable[..., list[ViewEdit]]]] = []
-    given = manifest["settings"]
-    if manifest["method"] == "attention_warping":
-        nothing = {"a0": 0.0, "unseen": "free", "reference": "none"}
-        settings = AttentionWarpingSettings.from_dict({**given, **nothing})
-        work, source = work_with(settings), names.index(manifest["source"])
-        method = AttentionWarping(work, settings, source, None, None, "cpu")
-        edits.append(((source,), method.edit_source))
-        targets = [view for view in left if view != source]
-        for _, same in groupby(targets, key=lambda view: work.sizes[view]):
-            for some in chunks([*same], settings.batch):
-                edits.append((some, partial(method.edit_targets, 0, some)))
+    kind = type(next(iter(PRESETS[name].values())))
+    settings: Any = kind.from_dict({**manifest["settings"], **NOTHING_CARRIED.get(name, {})})
+    work = Work(
+        gaussians, scene, editor, manifest["instruction"], settings, "auto", folder, report,
+        segments,
+    )  # fmt: skip
+    method: Any
+    if name == "attention_warping":
+        method = AttentionWarping(work, settings, names.index(source), None, None, "cpu")
+        edited = folder.read_picture(f"views/{source}.png").astype(np.float32) / np.float32(255)
+        method.views.keep(RecordedSource(edited, None))
+    elif name == "guided":
+        first = manifest["rounds"][0]["views"][0]
+        method = Guided(work, settings, names.index(first), None)
+    elif name in NOTHING_CARRIED:
+        method = {"dge": DGE, "gaussctrl": GaussCtrl, "igs2gs": IGS2GS}[name](work, settings)
     else:
+        given = manifest["settings"]
         shared = {field.name for field in fields(ByViewSettings)} & given.keys()
-        alone = ByViewSettings.from_dict({name: given[name] for name in shared})
-        work = work_with(alone)
-        by_view = ByView(work, alone)
-        edits += [(batch, partial(by_view.edit, batch)) for batch in by_view.batches(left)]
-    for number, (batch, edit) in enumerate(edits):
-        report.step(number, len(edits), "control: each view of the page edited alone")
-        for view, one in zip(batch, edit(work.frozen, lambda: None), strict=True):
-            if view in left:
-                folder.write_picture(files[view], to_bytes(work.composite(view, one.picture)))
+        method = ByView(work, ByViewSettings.from_dict({name: given[name] for name in shared}))
+    loop = _Control(work, files, left, from_tuned=name != "igs2gs")
+    if isinstance(method, ByView):
+        loop.last = dict.fromkeys(left, 0)
+    method.run(loop)
+
+
+class _Control:
+    """Loop that writes the last edit of some views, without tuning.
+
+    Args:
+        files: path in the run's folder of each view's edit.
+        from_tuned: True edits with the splats of the run's rounds, False with those before.
+    """
+
+    def __init__(
+        self, work: Work, files: Mapping[int, str], left: Sequence[int], from_tuned: bool
+    ) -> None:
+        self.work, self.files, self.left, self.from_tuned = work, files, left, from_tuned
+        names, has = file_stems(work.views.cameras), work.folder.has
+        rounds = range(len(work.folder.read_json(MANIFEST)["rounds"]))
+        self.last = {
+            view: max((k for k in rounds if has(edit_file(k, names[view]))), default=0)
+            for view in left
+        }
+
+    def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
+        """Edit views together, if this is the last edit of some that are left."""
+        wanted = {view for view in views if self.last.get(view) == number}
+        if not wanted or all(self.work.folder.has(self.files[view]) for view in wanted):
+            return
+        done = sum(self.work.folder.has(self.files[view]) for view in self.left)
+        self.work.report.step(done, len(self.left), "control: each view of the page edited alone")
+        model, tuned = self.work.frozen, self.work.folder.path / f"rounds/{number}.ply"
+        if number and self.from_tuned and tuned.is_file():
+            model = read_ply(tuned)
+        for view, one in zip(views, edit(model, lambda: None), strict=True):
+            if view in wanted:
+                picture = self.work.composite(view, one.picture)
+                self.work.folder.write_picture(self.files[view], to_bytes(picture))
+
+    def tune(
+        self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
+    ) -> None:
+        """Leave the splats as they are."""
 
 
 def disagreement(
