@@ -218,13 +218,21 @@ class ViewEdits:
                 f"stages: {stages}{on_source} in place of {asked.stages}, as {views} views leave"
                 " no more to edit"
             )
+        size = self.latent_size(self.source)
+        others = [k for k in range(views) if self.latent_size(k) != size]
+        if asked.noise == "surface" and others:
+            lines.append(
+                f"noise: that of {len(others)} of {views} views does not stick to the surface, as"
+                f" their edits have another size than the source's (first: {self.names[others[0]]})"
+                "; crop the pictures to one shape"
+            )
         if self._wants_attention and not self.attends:
             lines.append(
                 "unseen: marked parts that no warp reaches are edited freely, as no self-attention"
                 " of a UNet is recorded that could attend to the source"
             )
         if self.features.layers:
-            plan = self.features.plan(self.latent_size(self.source))
+            plan = self.features.plan(size)
             lines.append(str(plan))
             if self.attends:
                 lines.append(f"for what no warp reaches, {self._tokens_plan(plan)}")

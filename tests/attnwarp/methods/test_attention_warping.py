@@ -667,6 +667,19 @@ def test_where_the_source_is_the_only_view_the_splats_are_tuned_on_it(scene, edi
     assert line.startswith("stages: 1 that tunes on the source alone in place of 2, as ")
 
 
+@pytest.mark.parametrize("width", [32, 48])
+def test_it_says_whose_noise_cannot_stick_to_the_surface(width, scene, editor):
+    """Oracle: latents of one size hold equally many noise values."""
+    model, cameras, images = scene
+    other = Camera(cameras[1].K, cameras[1].world_to_camera, width, 32, "wide.png")
+    part = model, [cameras[0], other], [images[0], np.zeros((32, width, 3), np.float32)]
+    lines = []
+    settings = replace(QUICK, steps=1, iterations=0, noise="surface", size=None)
+    run(part, editor, settings=settings, report=Watched(log=lines.append))
+    said = [line for line in lines if line.startswith("noise: that of 1 of 2 views does not stick")]
+    assert len(said) == (width != 32) and all("first: wide" in line for line in said)
+
+
 def noise(settings, views):
     from attnwarp.methods.carried import initial_noise
 
