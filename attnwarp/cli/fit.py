@@ -238,6 +238,11 @@ def _fit(
     if first is not None and start is not None:
         check_seen(start, first, train.cameras, report)
         warn_of_misfit(start, first, train)
+        if settings.max_splats is not None and len(first) > settings.max_splats:
+            raise ValueError(
+                f"--max-splats: got {settings.max_splats}, but {start} holds {len(first)} splats,"
+                " and a fit drops none for the limit; take more, or leave it out"
+            )
         first = first.with_sh_degree(settings.sh_degree)
     else:
         first = attnwarp.fit.first_splats(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -222,9 +224,10 @@ def first_splats(
     Args:
         dataset: dataset with points and colours.
         cameras: cameras of the fitted views.
-        settings: kind, degree and seed of the splats.
-        report: receiver of a line if random points are used, or if points lie too far
-            away (:func:`within_reach`).
+        settings: kind, degree, seed and largest number of the splats; of more, as many are drawn
+            at random, and widened.
+        report: receiver of a line if random points are used, if points lie too far away
+            (:func:`within_reach`), or if there are more than ``max_splats``.
         random: number of random points.
         views: fitted pictures, which give the sky its colours; None begins without a sky.
 
@@ -260,11 +263,18 @@ def first_splats(
         seed=settings.seed,
         cameras=cameras,
     )
-    if views is None or not settings.sky:
-        return start
-    from attnwarp.fit.sky import with_sky
+    if views is not None and settings.sky:
+        from attnwarp.fit.sky import with_sky
 
-    return with_sky(start, views)
+        start = with_sky(start, views)
+    most = settings.max_splats
+    if most is None or len(start) <= most:
+        return start
+    report.log(f"beginning with {most} of {len(start)} first splats, as max_splats is {most}")
+    drawn = torch.randperm(len(start), generator=torch.Generator().manual_seed(settings.seed))
+    # Fewer splats cover the same surface.
+    wider = start.scales * math.sqrt(len(start) / most)
+    return replace(start, scales=wider).select(drawn[:most].sort().values)
 
 
 def random_points(

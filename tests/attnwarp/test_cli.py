@@ -289,6 +289,9 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
     done = in_process("fit", data, *once, "--start", far, "--out", tmp_path / "c")
     assert done.exit_code == 2 and "cover less than" in done.stderr
 
+    few = ("--start", splats, "--max-splats", 1)
+    done = in_process("fit", data, *once, *few, "--out", tmp_path / "c")
+    assert done.exit_code == 2 and "--max-splats: got 1, but" in done.stderr
     done = in_process("fit", data, *once, "--start", splats, "--points", 9, "--out", tmp_path / "c")
     assert done.exit_code == 2 and "--points: got 9, but --start names" in done.stderr
 

@@ -414,3 +414,18 @@ def test_points_far_astray_begin_no_splats_and_are_told(unit):
         np.delete(points, (7, 9), 0), np.delete(colors, (7, 9), 0), kind="2d", sh_degree=0
     )
     assert splats.digest() == expected.digest()
+
+
+def test_of_more_first_splats_than_a_fit_may_have_some_are_drawn_and_widened():
+    """Oracle: a grid in a plane, whose first splats are all of one size."""
+    flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
+    data, said = Dataset(ring(3), ["a.png"] * 3, points=flat), []
+    settings = FitSettings(sh_degree=0, max_splats=400)
+    some = first_splats(data, data.cameras, settings, Watched(log=said.append))
+    every = first_splats(data, data.cameras, FitSettings(sh_degree=0))
+    assert said == ["beginning with 400 of 1600 first splats, as max_splats is 400"]
+    assert len(some) == 400
+    places = set(map(tuple, some.world_means()))
+    assert len(places) == 400 and places <= set(map(tuple, every.world_means()))
+    # A quarter of the discs, each of four times the area.
+    torch.testing.assert_close(some.scales.median(), 2 * every.scales.median())
