@@ -268,6 +268,9 @@ def _fit(
             f"{error} (--restart does so; --start SPLATS.ply goes on from splats in another folder)"
         ) from error
     _write_results(out, result, views, held_out)
+    share = attnwarp.fit.without_surface(result.gaussians, views)
+    if line := attnwarp.fit.say_without_surface(share):
+        typer.echo(line)
     return result
 
 

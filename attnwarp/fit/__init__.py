@@ -5,7 +5,7 @@ docs/method/fitting.md.
 from attnwarp.fit.exposure import read_exposures
 from attnwarp.fit.loop import Fit, Record, fit
 from attnwarp.fit.settings import FitSettings
-from attnwarp.fit.sky import with_sky
+from attnwarp.fit.sky import say_without_surface, with_sky, without_surface
 from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
 from attnwarp.fit.views import Views, hold_out, load_views
 from attnwarp.fit.warm import compile_kernels
@@ -24,5 +24,7 @@ __all__ = [
     "load_views",
     "random_points",
     "read_exposures",
+    "say_without_surface",
     "with_sky",
+    "without_surface",
 ]

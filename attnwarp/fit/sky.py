@@ -10,7 +10,8 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.devices import on_cpu_unless_named
-from attnwarp.fit.start import usual_distance
+from attnwarp.fit.settings import FitSettings
+from attnwarp.fit.start import extent_of, usual_distance
 from attnwarp.fit.views import Views
 from attnwarp.gaussians import Gaussians
 
@@ -34,6 +35,13 @@ BAND = 0.1
 
 OVERLAP = 0.6
 """Size of a first sky splat over the distance to its neighbours."""
+
+LOOKS, LOOK_SIZE = 24, 256
+"""Largest number of views, and their longest side in px, whose share without surface is measured: a
+share of areas needs no more."""
+
+LITTLE = 0.02
+"""Share without surface that is not worth a word, such as gaps between splats."""
 
 OPACITY = 0.9
 """Opacity of the first sky splats: a clear shell would let the scene's splats grow into the sky."""
@@ -108,6 +116,58 @@ def with_sky(start: Gaussians, views: Views) -> Gaussians:
             name: torch.cat([getattr(start, name), value.to(getattr(start, name))])
             for name, value in added.items()
         },
+    )
+
+
+@on_cpu_unless_named
+def without_surface(gaussians: Gaussians, views: Views) -> float:
+    """Share of the pictures' area, in [0, 1], that shows no surface: no depth, or less than half of
+    it opaque, as in the sky and where there are no splats. :func:`say_without_surface` words it.
+
+    What masks ignore is left out. At most :data:`LOOKS` views are looked at, evenly spread and no
+    larger than :data:`LOOK_SIZE`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.fit import Views
+        >>> from attnwarp.fit.sky import without_surface
+        >>> from attnwarp.trial import disc, view
+        >>> share = without_surface(disc(0.3), Views([view(side=32)], [np.zeros((32, 32, 3))]))
+        >>> 0.8 < share < 1
+        True
+    """
+    from attnwarp.warp import preset, render_surface, resize_mask
+
+    settings = preset("corrected")
+    opaque = settings.opaque or 0.0
+    near = FitSettings().near * extent_of(views.cameras, gaussians.world_means())
+    empty = total = 0.0
+    for k in np.unique(np.linspace(0, len(views) - 1, LOOKS).round().astype(int)):
+        camera, kept = views.cameras[k], views.kept(k, torch.device("cpu"))
+        scale = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
+        w, h = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+        seen = render_surface(gaussians, camera.resize(w, h), settings, near=near)
+        none = np.isnan(np.asarray(seen.depth)) | (np.asarray(seen.alpha) < opaque)
+        counted = np.ones((h, w), bool) if kept is None else resize_mask(kept, (h, w)).numpy()
+        empty += float((none & counted).mean())
+        total += float(counted.mean())
+    return empty / total if total else 0.0
+
+
+def say_without_surface(share: float) -> str:
+    """Write a sentence, without its full stop, about the result of :func:`without_surface`; empty
+    for a share below :data:`LITTLE`.
+
+    Example:
+        >>> from attnwarp.fit.sky import say_without_surface
+        >>> say_without_surface(0.234)[:51]
+        "23 % of the pictures' area has no surface (sky or e"
+    """
+    if share < LITTLE:
+        return ""
+    return (
+        f"{100 * share:.0f} % of the pictures' area has no surface (sky or empty): nothing is"
+        " warped, masked or clicked there"
     )
 
 

@@ -26,6 +26,8 @@ from attnwarp.fit import (
     first_splats,
     fit,
     load_views,
+    say_without_surface,
+    without_surface,
 )
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, write_ply
@@ -162,6 +164,9 @@ def edit_dataset(
     torch.set_num_threads(options.threads or core_count())
     splats = splats.to(device=device)
     compile_kernels(splats.kind, report, device)
+    if line := say_without_surface(without_surface(splats, views)):
+        report.log(line)
+        notes = [*notes, line]
     result = METHODS[method](
         splats,
         views.cameras,

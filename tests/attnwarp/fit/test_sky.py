@@ -1,13 +1,14 @@
 """Fits of a scene under a sky, which has no depth: a disc of it must not pay for colour with depth."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from attnwarp import Camera
-from attnwarp.fit import FitSettings, Views, fit, from_points, with_sky
+from attnwarp import Camera, Gaussians
+from attnwarp.fit import FitSettings, Views, fit, from_points, with_sky, without_surface
 from attnwarp.fit.model import LARGEST
 from attnwarp.render import render
 
@@ -103,3 +104,25 @@ def test_a_fit_under_a_sky_keeps_its_depth(seed):
     error = np.concatenate(errors)
     # Half a pixel at the card's outline, and the ground's far end, which no first point describes.
     assert np.median(error) < 0.05 and (error > 0.5).mean() < 0.02
+
+
+def test_the_area_without_a_surface_is_measured_where_no_mask_ignores_it():
+    """Oracle: a wall before the left half of a picture, whole or so far away that it is sky."""
+    across, up = torch.meshgrid(torch.arange(-60, 0), torch.arange(-60, 60), indexing="ij")
+    places = torch.stack([across + 0.5, up + 0.5, 0 * up], -1).reshape(-1, 3).float() / 20
+    n = len(places)
+    wall = Gaussians(
+        "2d", places, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 2), 0.04),
+        torch.full((n,), 0.99), torch.zeros(n, 1, 3),
+    )  # fmt: skip
+    size = {"width": 64, "height": 48}
+    front = Camera.look_at((0, 0, 3), (0, 0, 0), **size, fov_y=40, up=(0, 1, 0))
+    right = np.arange(64)[None].repeat(48, 0) >= 32
+    shot = [np.zeros((48, 64, 3), np.uint8)]
+
+    def share(scene, *mask):
+        return without_surface(scene, Views([front], shot, mask))
+
+    assert share(wall) == pytest.approx(0.5, abs=0.02)
+    assert share(wall, right) > 0.96 and share(wall, ~right) < 0.02
+    assert share(replace(wall, far=0.01)) == 1
