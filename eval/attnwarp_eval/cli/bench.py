@@ -59,10 +59,11 @@ def run(
     # As in "attnwarp edit", a method's ValueError is about the input.
     with clear_errors(strict=False), reporter(title=out.name) as report:
         from attnwarp.cli.shell import assignments
+        from attnwarp.io.lock import alone_in
         from attnwarp_eval.bench.run import run as edit
 
         options = assignments(changes or [], {"seed": "--seed"})
-        with resumable(lambda: "finished edits are kept"):
+        with resumable(lambda: "finished edits are kept"), alone_in(out):
             edit(folder, out, method, editor, options=options, seed=seed, report=report)
     typer.echo(out / "method.json")
 

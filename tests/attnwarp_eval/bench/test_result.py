@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
 from attnwarp.io import read_image
+from attnwarp.io.lock import alone_in
 from attnwarp_eval.bench import EDITORS, result, run, score, suite
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.plugins import load_plugins
@@ -159,6 +160,9 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
         ]
         done = CliRunner().invoke(app, call)
         assert done.exit_code == 2 and said in done.stderr
+    with alone_in(out):  # another process runs there
+        done = CliRunner().invoke(app, ["bench", "run", str(bench), str(out), "--method", "warp"])
+    assert done.exit_code == 2 and "another run writes to this folder" in done.stderr
     scores = score.score(bench, out, tmp_path / "score").scores
     (one,) = (s for s in scores if s.edit == "colour")
     # The ideal editor knows the only answer, and leaves the rest alone to the width of a token.
