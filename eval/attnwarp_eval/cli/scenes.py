@@ -117,12 +117,7 @@ def draw(
             "NAME=VALUE",
         ),
     ] = None,
-    meshes: Annotated[
-        Path | None, option("Folder of meshes (OBJ, PLY, STL, GLB, OFF) to put there.")
-    ] = None,
-    stratify: Annotated[
-        str | None, option("Axes spread evenly over the scenes (comma-separated).")
-    ] = None,
+    meshes: Annotated[Path | None, option("Folder of meshes (GLB, PLY) to put there.")] = None,
 ) -> None:
     """Draw scenes that no one made by hand, with cameras, edits and bounces.
 
@@ -143,9 +138,7 @@ def draw(
             except ValueError:
                 raise InputError(f"--axis: got {text!r}, expected such as occlusion=0.9") from None
         what = {"drawn": count} if meshes is None else {"meshes": str(meshes), "n": count}
-        wanted = population(
-            {**what, "seed": seed, "axes": fixed, "stratify": names(stratify) or []}
-        )
+        wanted = population({**what, "seed": seed, "axes": fixed})
         with reporter(title="drawing") as report:
             for k, scene in enumerate(wanted.scenes()):
                 write(scene, out)

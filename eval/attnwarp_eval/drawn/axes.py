@@ -1,25 +1,14 @@
-"""Axes of difficulty of drawn scenes: their settings, and the quantities that measure them.
-
-A scene's position on an axis is drawn, fixed by a study, or spread evenly over its scenes. The
-quantities are measured on the exact geometry and never used to draw: they show that an axis works
-as described.
-"""
+"""Axes of difficulty of drawn scenes. A scene's position on an axis is drawn, or fixed by a study."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from attnwarp.errors import InputError, suggest
-from attnwarp_eval.scene.materials import DiffuseMaterial
-from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.truth import Geometry, two_view
-from attnwarp_eval.truth.shading import object_albedo
-from attnwarp_eval.two_view import HIDDEN, Hits
 
 FEWEST, MOST = 2, 6
 """Number of things in a drawn scene."""
@@ -64,7 +53,7 @@ def drawn_axes(rng: np.random.Generator, fixed: Mapping[str, float]) -> Axes:
     return Axes(**values, things=int(fixed.get("things", number)))
 
 
-def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None:
+def check_axes(fixed: Mapping[str, Any]) -> None:
     """Refuse unknown axes, and positions out of range.
 
     Raises:
@@ -75,7 +64,7 @@ def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None
         Traceback (most recent call last):
         attnwarp.errors.InputError: axes.thin: got 2, expected a number from 0 to 1
     """
-    for name in (*fixed, *stratified):
+    for name in fixed:
         if name not in NAMES:
             raise InputError(
                 f"axes: no axis {name!r}{suggest(str(name), NAMES)}; they are {', '.join(NAMES)}"
@@ -87,81 +76,6 @@ def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None
             raise InputError(f"axes.{name}: got {value!r}, expected a number from {low} to {high}")
         if not low <= value <= high:
             raise InputError(f"axes.{name}: got {value}, expected a number from {low} to {high}")
-    for name in stratified:
-        if name in fixed:
-            raise InputError(f"stratify: {name!r} is fixed under axes; leave out one of the two")
-
-
-def spread(name: str, count: int, seed: int) -> list[float]:
-    """Places on an axis for ``count`` scenes, one in each of ``count`` equal parts, in random
-    order.
-
-    Example:
-        >>> sorted(spread("occlusion", 4, seed=1))
-        [0.125, 0.375, 0.625, 0.875]
-        >>> sorted(spread("things", 5, seed=1))
-        [2, 3, 4, 5, 6]
-    """
-    rng = np.random.default_rng([seed, *b"strata", *name.encode()])
-    middles = (rng.permutation(count) + 0.5) / count
-    if name == "things":
-        return [FEWEST + int(value * (MOST - FEWEST + 1)) for value in middles]
-    return [round(float(value), 4) for value in middles]
-
-
-def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict[str, float]:
-    """The quantity of each axis, from exact geometry and albedo.
-
-    docs/truth/drawn-scenes.md defines them. "thin" counts the pixels of things and fences
-    within 1.5 % of the height of another object, "texture" steps between pixels of one object.
-
-    Args:
-        scene: with a target ``yaw060``.
-        groups: group of each object by name: "thing 0" and so on, "fence", "around".
-        size: size of the traced views, px.
-    """
-    small = scene.with_size(size, size)
-    geometry = Geometry(small)
-    source, aside = small.source, small.camera("yaw060")
-    hits, pair = geometry.trace(source), two_view(geometry, source, aside)
-    names = np.array([groups[name] for name in small.object_names])
-    group = np.where(hits.valid, names[np.maximum(hits.object_id, 0)], "around")
-    standing, thing = group != "around", np.char.startswith(group.astype(str), "thing")
-    shiny = np.array([not isinstance(o.material, DiffuseMaterial) for o in small.spec.objects])
-    hidden = float((pair.label == HIDDEN).sum())
-    return {
-        "occlusion": hidden / max(hidden + float(pair.visible.sum()), 1.0),
-        "thin": _near_edges(hits.object_id, standing, round(0.015 * size)),
-        "grazing": _share(hits.cosine[hits.valid] < np.cos(np.radians(75))),
-        "texture": _steps(small, geometry, hits),
-        "highlights": _share(shiny[hits.object_id[thing]]),
-        "things": float(len({name for name in names if name.startswith("thing")})),
-    }
-
-
-def _share(chosen: npt.NDArray[np.bool_]) -> float:
-    return float(chosen.mean()) if chosen.size else 0.0
-
-
-def _near_edges(
-    object_id: npt.NDArray[np.int32], standing: npt.NDArray[np.bool_], reach: int
-) -> float:
-    """Share of the things' pixels within ``reach`` px of another object."""
-    from scipy import ndimage
-
-    side = 2 * reach + 1
-    low, high = (f(object_id, size=side) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    return _share((low != high)[standing])
-
-
-def _steps(scene: Scene, geometry: Geometry, hits: Hits) -> float:
-    """Mean albedo step between neighbouring pixels of one object."""
-    color = np.zeros((*hits.valid.shape, 3))
-    ids = hits.primitive_id[hits.valid]
-    color[hits.valid] = object_albedo(scene, geometry, hits.point[hits.valid], ids)
-    step = np.abs(color[:, 1:] - color[:, :-1]).mean(-1)
-    same = hits.valid[:, 1:] & (hits.object_id[:, 1:] == hits.object_id[:, :-1])
-    return float(step[same].mean())
 
 
 def to_words(axes: Axes) -> str:

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from attnwarp.errors import InputError
 from attnwarp.process import cache_dir
 from attnwarp_eval.cache import content_key
-from attnwarp_eval.drawn.axes import check_axes, spread
+from attnwarp_eval.drawn.axes import check_axes
 from attnwarp_eval.drawn.files import write
 from attnwarp_eval.drawn.meshes import LONGEST_EDGE, MeshDraft, mesh_files
 from attnwarp_eval.drawn.scenes import Drawn, draw
@@ -29,11 +29,17 @@ class _Scenes(Spec, ABC):
     generator: Literal[1] = 1
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     axes: dict[str, float] = Field(default_factory=dict)
-    stratify: tuple[str, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_stored_runs(cls, data: Any) -> Any:
+        """Runs and committed results have an empty key of an older version."""
+        empty = isinstance(data, dict) and data.get("stratify") in ([], ())
+        return {k: v for k, v in data.items() if k != "stratify"} if empty else data
 
     @model_validator(mode="after")
     def _known_axes(self) -> Self:
-        check_axes(self.axes, self.stratify)
+        check_axes(self.axes)
         return self
 
     word: ClassVar[str]
@@ -64,8 +70,7 @@ class _Scenes(Spec, ABC):
     def words(self) -> str:
         """The population in words, for a report."""
         fixed = "".join(f", {name} {value:g}" for name, value in self.axes.items())
-        spreads = f", {' and '.join(self.stratify)} spread evenly" if self.stratify else ""
-        return f"{self._what()} by generator {self.generator}, seed {self.seed}{fixed}{spreads}"
+        return f"{self._what()} by generator {self.generator}, seed {self.seed}{fixed}"
 
     @property
     def names(self) -> list[str]:
@@ -77,11 +82,6 @@ class _Scenes(Spec, ABC):
         for k in range(self.count):
             yield self.scene(k)
 
-    def places(self, number: int) -> dict[str, float]:
-        """Positions of a scene on the fixed and the stratified axes."""
-        spreads = {name: spread(name, self.count, self.seed)[number] for name in self.stratify}
-        return {**self.axes, **spreads}
-
     def sized(self, count: int) -> Self:
         """Copy of the population with another number of scenes."""
         return self.model_copy(update={self._number: count})
@@ -89,8 +89,7 @@ class _Scenes(Spec, ABC):
     def paths(self) -> dict[str, Path]:
         """Files of the scenes by name, some of which may not be drawn yet."""
         kept = self.model_dump(mode="json")
-        if not self.stratify:
-            kept.pop(self._number)  # a larger population has the scenes of a smaller one
+        kept.pop(self._number)  # a larger population has the scenes of a smaller one
         folder = cache_dir() / "drawn" / content_key(kept, self._decided_by())[:16]
         return {name: folder / f"{name}.yaml" for name in self.names}
 
@@ -111,7 +110,6 @@ class DrawnScenes(_Scenes):
         generator: number of the generator; only 1 exists.
         seed: two seeds share no scene.
         axes: fixed positions on axes of difficulty; the others are drawn.
-        stratify: axes over which the scenes are spread evenly.
 
     Example:
         >>> population = DrawnScenes(drawn=2, seed=7, axes={"things": 3})
@@ -130,7 +128,7 @@ class DrawnScenes(_Scenes):
 
     def scene(self, number: int) -> Drawn:
         """Draw one scene."""
-        return draw(number, self.seed, self.places(number))
+        return draw(number, self.seed, self.axes)
 
 
 class MeshScenes(_Scenes):
@@ -161,9 +159,8 @@ class MeshScenes(_Scenes):
 
     def scene(self, number: int) -> Drawn:
         """Draw one scene."""
-        places = self.places(number)
         return MeshDraft(
-            number, self.seed, places, meshes=self._paths, up=self.up or "y"
+            number, self.seed, self.axes, meshes=self._paths, up=self.up or "y"
         ).finished()
 
 

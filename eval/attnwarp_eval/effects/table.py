@@ -10,26 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.errors import InputError
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.plan import everything_on, plan
 
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene needs, and that no plan omits."""
 
-TIMED = (
-    "time, everything on / plan",
-    "at equal noise",
-    "light changed by the cap",
-    "time, everything on within the cap / plan",
-    "at equal error",
-)
+TIMED = ("time, everything on within the cap / plan", "at equal error")
 """Columns that come from timing."""
 
 AMPLIFIED = 8.0
@@ -120,31 +112,18 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
 
 def table(entries: Iterable[Mapping[str, Any]]) -> Table:
     """The entries as a table: effects, plan, proof and times."""
-    columns = [
-        "scene",
-        "beyond the usual",
-        "not simulated",
-        "plan",
-        "proof",
-        "bound",
-        "smallest difference seen",
-        *TIMED,
+    columns = ["scene", "beyond the usual", "not simulated", "plan", "proof", *TIMED]
+    rows = [
+        [
+            entry["scene"],
+            ", ".join(name for name in entry["needed"] if name not in USUAL) or "–",
+            ", ".join(entry["not_simulated"]) or "–",
+            plan_words(entry["plan"]),
+            proof_words(entry["proof"]) if "proof" in entry else "not asked",
+            *_times(entry.get("cost")),
+        ]
+        for entry in entries
     ]
-    rows = []
-    for entry in entries:
-        proof, cost = entry.get("proof"), entry.get("cost")
-        rows.append(
-            [
-                entry["scene"],
-                ", ".join(name for name in entry["needed"] if name not in USUAL) or "–",
-                ", ".join(entry["not_simulated"]) or "–",
-                plan_words(entry["plan"]),
-                "not asked" if proof is None else proof_words(proof),
-                _bound(proof),
-                _smallest(proof),
-                *_times(cost),
-            ]
-        )
     return Table(columns, rows, timed=TIMED)
 
 
@@ -162,104 +141,33 @@ def proof_words(proof: Mapping[str, Any]) -> str:
     return f"{proof['verdict']} ({proof['of_simulated']} but for what is not simulated)"
 
 
-def _bound(proof: Mapping[str, Any] | None) -> str:
-    if proof is None:
-        return "–"
-    if "any" in proof["detectable"]:
-        return "same bits"
-    for rung in proof["rungs"]:
-        if rung["name"] == "equivalence":
-            means = rung["numbers"]
-            return f"{Equivalence(means['difference'], means['error'], means['margin']).bound:.2%}"
-    return "–"
-
-
-def _smallest(proof: Mapping[str, Any] | None) -> str:
-    if proof is None or "any" in proof["detectable"]:
-        return "–"
-    return ", ".join(
-        f"{name} {proof['detectable'][name]:.2g}"
-        for name in ("picture", "block", "pixel")
-        if name in proof["detectable"]
-    )
-
-
 def _times(cost: Mapping[str, Any] | None) -> list[str]:
+    """Ratios of seconds, and of seconds at equal error, of everything on within the cap and the
+    plan; without a cap equal noise is equal error.
+    """
     if cost is None:
         return ["–"] * len(TIMED)
-
-    def ratio(equal: float | None, interval: Sequence[float] | None) -> str:
-        between = f" [{number(interval[0])}, {number(interval[1])}]" if interval else ""
-        return "the plan has no noise" if equal is None else number(equal) + between
-
-    noise, cap = ratio(cost["at_equal_noise"], cost["interval"]), cost["cap"]
-    if cap is None:
-        # Both pictures have the same mean, so equal noise is equal error.
-        return [number(cost["faster"]), noise, "no cap", number(cost["faster"]), noise]
-    bias = "–"
-    if cap["bias"] is not None:
-        bias = (
-            f"{cap['bias']:+.1%} [{cap['bias_interval'][0]:+.1%}, {cap['bias_interval'][1]:+.1%}]"
-        )
-    return [
-        number(cost["faster"]),
-        noise,
-        bias,
-        number(cap["faster"]),
-        ratio(cap["at_equal_error"], cap["interval"]),
-    ]
+    of = cost["cap"] or {**cost, "at_equal_error": cost["at_equal_noise"]}
+    equal, bounds = of["at_equal_error"], of["interval"]
+    if equal is None:
+        return [number(of["faster"]), "the plan has no noise"]
+    between = f" [{number(bounds[0])}, {number(bounds[1])}]" if bounds else ""
+    return [number(of["faster"]), number(equal) + between]
 
 
 def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Report:
-    """The table, and the pictures side by side; ``about`` is the environment.
-
-    Raises:
-        InputError: the entries were timed differently.
-    """
+    """The table, and the pictures side by side; ``about`` is the environment."""
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
-    partly = (
-        sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries)
-        - certified
-    )
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
-    # The lead describes one way of timing, given by the rounds and Mitsuba's variant.
-    costs = {
-        tuple(e["cost"][key] for key in ("size", "spp", "rounds")) for e in entries if "cost" in e
-    }
-    if len(costs) > 1:
-        kinds = "; ".join(f"{n} x {n}, {spp} samples, {k} rounds" for n, spp, k in sorted(costs))
-        raise InputError(
-            f"entries: timed in {len(costs)} ways ({kinds}), expected one;"
-            " make the table again in another folder"
-        )
     lead = [
-        f"{len(entries)} scenes, {certified} of their plans certified"
-        + (f", {partly} more but for what is not simulated" if partly else "")
-        + f". Mitsuba {about['versions']['mitsuba']} as "
-        f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
-        (
-            f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of"
-            " docs/truth/truth.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
-            " picture's mean, which must stay below 1 %; the **smallest difference** that would"
-            " have been seen with 80 % chance is a share of the picture's mean, for the picture,"
-            " an 8 x 8 block and a pixel."
-        ),
+        f"{len(entries)} scenes, {certified} of their plans certified. Mitsuba"
+        f" {about['versions']['mitsuba']} as {variants}. Made by `attnwarp-eval scenes effects"
+        " --all --prove --out <this folder>`.",
+        f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of"
+        " docs/truth/truth.md. **Times**: in turn, against everything on within the scene's cap on"
+        " bounces, whose pictures have the plan's mean; intervals are 95 %, by bootstrap over"
+        " rounds. Above 1 the plan saves.",
     ]
-    if costs:
-        ((size, spp, rounds),) = costs
-        lead.append(
-            f"**Times**: {size} x {size}, {spp} samples, in turn, {rounds} rounds. Everything on"
-            " follows light until roulette ends"
-            " it. **At equal noise**: the same times the ratio of variances. Where a scene caps"
-            " its bounces, the plan leaves light out, so that"
-            " the two pictures have other means and equal noise is not equal error: the **light"
-            " changed by the cap** is the mean of the plan's pictures against that of everything"
-            " on without a cap. **At equal error** is therefore against everything on within the"
-            " cap, which is 1 where the plan is that, and whose"
-            " pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds (of the"
-            " light by Welch's test); above 1 the plan saves. An interval that holds 1 says that"
-            " nothing was seen to be saved."
-        )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
     drawn = [entry for entry in entries if "largest_difference" in entry]
     if drawn:

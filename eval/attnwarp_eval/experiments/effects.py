@@ -12,8 +12,6 @@ from attnwarp_eval.cost import environment
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
 from attnwarp_eval.effects.table import Settings, measure_entry, side_by_side
-from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
-from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
@@ -32,29 +30,24 @@ def collect(
     """Compute the table's entries and write them, with their pictures, below ``out``.
 
     Each entry is a cell of the run's folder, and so are its pictures. After an interruption, or
-    when one scene has changed, only missing cells are computed. An existing table stays until all
-    of its rows are computed again.
+    when one scene has changed, only missing cells are computed.
 
     Args:
         names: scenes' names or paths.
         out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
 
     Raises:
-        InputError: a scene that is unknown or contradicts itself, two scenes of one name, another
-            run that is writing to ``out``, or rows of its ``effects.json`` that would be lost.
+        InputError: a scene that is unknown or contradicts itself, or another run that is writing to
+            ``out``.
     """
+    from attnwarp_eval.scene.file import load_scene
+
     store = Store(out)
-    scenes = distinct_scenes(names)
-    asked = {(scene.name,) for scene in scenes}
-    stored = check_nothing_is_lost(out / "effects.json", "scenes", ("scene",), asked)
+    scenes = [load_scene(name) for name in dict.fromkeys(names)]
     tasks, parts = _tasks(scenes, store, settings), 1 + settings.pictures
     entries: dict[str, dict[str, Any]] = {}
-    for done, (name, part) in enumerate(
-        results(store, tasks, len(scenes) * parts, report), start=1
-    ):
+    for name, part in results(store, tasks, len(scenes) * parts, report):
         entries.setdefault(name, {}).update(part)
-        if not stored <= {(scene.name,) for scene in scenes[: done // parts]}:
-            continue
         # Finished entries can be read while the others are computed.
         about = environment()
         data = {"environment": about, "scenes": [entries[name] for name in sorted(entries)]}

@@ -10,7 +10,6 @@ import trimesh
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.drawn.axes import NAMES, measured
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.population import DrawnScenes
 from attnwarp_eval.drawn.scenes import FIRST_SHAPE, YAWS, draw
@@ -122,37 +121,6 @@ def test_the_four_answers_of_the_parts_give_each_of_twelve_parts_each_colour_onc
         assert len(set(part)) == 4
     # One surface covers all objects of the thing.
     assert {c.texture for c in answers[1].changes} == {textures[1]}
-
-
-@pytest.mark.parametrize(
-    "axis",
-    [pytest.param(name, marks=[pytest.mark.slow] if name != "grazing" else []) for name in NAMES],
-)
-def test_the_quantity_of_an_axis_rises_with_it(axis):
-    middle = {
-        "occlusion": 0.5,
-        "thin": 0.3,
-        "grazing": 0.3,
-        "texture": 0.5,
-        "highlights": 0.4,
-        "things": 4,
-    }
-    low, high = (2, 6) if axis == "things" else (0, 1)
-
-    def quantity(number, place):
-        drawn = draw(number, seed=3, axes={**middle, axis: place})
-        return measured(Scene(drawn.spec), drawn.groups, size=48)[axis]
-
-    pairs = [(quantity(k, low), quantity(k, high)) for k in range(8)]
-    # By chance seven of eight would rise in 3.5 % of the draws.
-    assert sum(after > before for before, after in pairs) >= 7, pairs
-
-
-def test_a_stratified_axis_has_one_scene_in_each_part_and_the_scenes_carry_their_place():
-    population = DrawnScenes(drawn=4, seed=2, stratify=("texture",), axes={"thin": 0.25})
-    axes = [scene.axes for scene in population.scenes()]
-    assert sorted(a.texture for a in axes) == [0.125, 0.375, 0.625, 0.875]
-    assert {a.thin for a in axes} == {0.25}
 
 
 def test_an_unknown_axis_is_refused_by_name(tmp_path):

@@ -12,14 +12,12 @@ from effect_scenes import FLOOR, SCENES, SKY, SUN, ball, make
 from scipy import stats
 from typer.testing import CliRunner
 
-from attnwarp.errors import InputError
 from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.effects import detect, saving, table
 from attnwarp_eval.effects.table import Settings, side_by_side
 from attnwarp_eval.experiments import effects
 from attnwarp_eval.experiments.effects import collect
-from attnwarp_eval.scene.file import scene_folders
 from attnwarp_eval.truth.plan import everything_on, plan
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
@@ -53,13 +51,7 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
         and " | path | not asked | " in text
     )
     assert text.count(".jpg)") == 3 and "3 scenes, 0 of their plans certified" in text
-    # A smaller table does not replace a larger one.
-    written = {path: path.read_bytes() for path in tmp_path.glob("effects.*")}
-    with pytest.raises(InputError, match=r"effects.json: mirror, opposed would be lost.* --out"):
-        collect(["glass"], tmp_path, quick)
-    assert {path: path.read_bytes() for path in written} == written
     # Another setting is another entry; a picture that is gone is drawn again.
-    (tmp_path / "effects.json").unlink()
     collect(["glass"], tmp_path, Settings(prove=False, rounds=3))
     picture = (tmp_path / "mirror.jpg").read_bytes()
     (tmp_path / "mirror.jpg").unlink()
@@ -67,40 +59,12 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
 
 
-def test_entries_that_were_timed_otherwise_are_refused_in_one_table():
-    planned = {"integrator": "direct", "sensor": {"type": "perspective"}}
-    cost = {"size": 48, "spp": 16, "rounds": 7, "faster": 2.0, "at_equal_noise": 2.0}
-    cost |= {"interval": [1.0, 3.0], "cap": None}
-    one = {"scene": "a", "needed": [], "not_simulated": [], "plan": planned, "cost": cost}
-    one |= {"variant": "scalar_rgb"}
-    about = {"versions": {"mitsuba": "3"}}
-    other = {**one, "cost": {**cost, "size": 96}}
-    assert any("48 x 48, 16 samples" in text for text in table.report([one, one], about).lead)
-    with pytest.raises(InputError, match=r"2 ways \(48 x 48, 16 .*; 96 x 96, 16 .*another folder"):
-        table.report([one, other], about)
-
-
-def test_a_name_is_one_scene(tmp_path):
-    text = (scene_folders()[-1] / "opposed.yaml").read_text()
-    (tmp_path / "opposed.yaml").write_text(text.replace("bounces: 1", "bounces: 2"))
-    names = ["opposed", str(tmp_path / "opposed.yaml")]
-    with pytest.raises(InputError, match="two scenes have the name 'opposed'"):
-        collect(names, tmp_path / "out", Settings())
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
+def test_a_proof_stands_in_the_table(small, tmp_path):
     # A budget for a busy machine; a quiet one needs a few seconds of it.
     (entry,) = collect(["opposed"], tmp_path, Settings(rounds=0, pictures=False, budget=240))
     assert entry["proof"]["verdict"] == "certified", entry["proof"]
-    ((_, _, _, _, verdict, bound, smallest, *times),) = table.table([entry]).rows
-    assert (
-        verdict == "certified"
-        and float(bound.rstrip("%")) < 1
-        and "picture" in smallest
-        and "pixel" in smallest
-    )
-    assert times == ["–"] * 5
+    ((_, _, _, _, verdict, *times),) = table.table([entry]).rows
+    assert verdict == "certified" and times == ["–"] * 2
 
 
 def test_in_fog_the_plan_is_everything_on_within_the_cap_and_never_loses(monkeypatch):
@@ -163,11 +127,11 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
         in text
     )
     row = table._times(json.loads(json.dumps(measured.to_dict())))
-    assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
+    assert row[0].startswith("2") and row[1].startswith("4.")
     endless = saving.measure(
         make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3
     )
-    assert endless.cap is None and table._times(endless.to_dict())[2] == "no cap"
+    assert endless.cap is None and len(table._times(endless.to_dict())) == 2
 
 
 def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak_of():

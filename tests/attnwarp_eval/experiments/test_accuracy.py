@@ -1,7 +1,6 @@
 """Measurement of the truth's own error and time, held to errors that are known."""
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,8 +12,7 @@ from attnwarp_eval.experiments import accuracy
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
-from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
-from attnwarp_eval.scene.file import load_scene, scene_folders
+from attnwarp_eval.scene.file import load_scene
 
 
 def test_the_brute_force_finds_hits_known_in_closed_form():
@@ -133,37 +131,9 @@ def test_tables_show_the_known_ratio_of_each_scene(tmp_path):
     assert "| again |" in text and "Left out" not in text
 
 
-def test_a_report_whose_panels_are_in_no_cell_is_not_overwritten(tmp_path):
-    path = tmp_path / "accuracy.json"
-    for content, words in (
-        (json.dumps({"panels": [asdict(depth_panel("far"))]}), "depth of far would be lost"),
-        ("{", "is not a file that this command wrote"),
-    ):
-        path.write_text(content)
-        result = CliRunner().invoke(app, ["scenes", "accuracy", "far", "--out", str(tmp_path)])
-        assert result.exit_code == 2 and "--out" in result.stderr
-        assert words in " ".join(result.stderr.split())
-        assert path.read_text() == content and [*tmp_path.iterdir()] == [path]
-
-
 def test_an_unknown_scene_is_one_line(tmp_path):
     result = CliRunner().invoke(app, ["scenes", "accuracy", "nowhere", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "nowhere" in result.output
-
-
-def test_two_scenes_of_one_name_are_refused_and_one_named_twice_is_one(tmp_path):
-    text = (scene_folders()[-1] / "opposed.yaml").read_text()
-    other = tmp_path / "opposed.yaml"
-    other.write_text(text.replace("bounces: 1", "bounces: 2"))
-    out = tmp_path / "out"
-    command = ["scenes", "accuracy", "--out", str(out), "opposed", str(other)]
-    result = CliRunner().invoke(app, command)
-    assert (result.exit_code, result.stdout) == (2, "") and not out.exists()
-    line = f"opposed and {other}: two scenes have the name 'opposed'"
-    assert line in " ".join(result.stderr.split())
-    assert [s.content_hash for s in distinct_scenes(["opposed", "fog", "opposed"])] == [
-        load_scene(name).content_hash for name in ("opposed", "fog")
-    ]
 
 
 @pytest.mark.slow

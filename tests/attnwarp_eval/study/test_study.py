@@ -387,14 +387,14 @@ def test_a_shipped_study_is_extended_by_its_name(tmp_path):
 
 
 def test_scenes_of_meshes_replace_the_drawn_ones_of_the_study_that_is_extended(tmp_path):
-    trimesh.creation.box().export(tmp_path / "box.obj")
-    base = BASE.replace("[spheres]", "{drawn: 9, generator: 1, seed: 7, stratify: [thin]}")
+    trimesh.creation.box().export(tmp_path / "box.glb")
+    base = BASE.replace("[spheres]", "{drawn: 9, generator: 1, seed: 7, axes: {thin: 0.5}}")
     meshes = "extends: base.yaml\nname: b\nscenes: {meshes: ., n: 1, seed: 3}\n"
     other = load_study(extending(tmp_path, meshes, base))
     assert other.scene_names == ["mesh-0"] and ", seed 3" in other.sampled
     fewer = "extends: base.yaml\nname: b\nscenes: {drawn: 1}\n"
     kept = load_study(extending(tmp_path, fewer, base))
-    assert kept.sampled.endswith("drawn by generator 1, seed 7, thin spread evenly")
+    assert kept.sampled.endswith("drawn by generator 1, seed 7, thin 0.5")
 
 
 def test_paths_of_an_extended_study_count_from_its_own_folder(tmp_path):

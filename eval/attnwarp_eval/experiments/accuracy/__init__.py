@@ -19,8 +19,6 @@ from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import Panel, panel_spec
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
-from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
-from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
@@ -45,14 +43,12 @@ def measure(
             skipped.
 
     Raises:
-        InputError: a scene that cannot be used, or two of one name; another run is writing to
-            ``out``; panels of its accuracy.json would be lost.
+        InputError: a scene that cannot be used; another run is writing to ``out``.
     """
+    from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.truth.mitsuba import forget
 
-    cells = _cells(distinct_scenes(names))
-    asked = {(question.__name__, scene.name) for question, scene in cells}
-    check_nothing_is_lost(out / "accuracy.json", "panels", ("question", "scene"), asked)
+    cells = _cells([load_scene(name) for name in dict.fromkeys(names)])
     tasks = (_task(question, scene, rounds) for question, scene in cells)
     for panel in results(Store(out), tasks, len(cells), report):
         yield panel
