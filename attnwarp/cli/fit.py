@@ -48,9 +48,6 @@ of a sound fit differ by less."""
 PATIENCE = 4
 """Evaluations without a gain after which a fit with held-out views stops."""
 
-SIZES = {"cpu": 512, "cuda": 1600}
-"""Longest side of larger pictures in px by default: the editors' size, and 3DGS's."""
-
 PIXELS_PER_SPLAT, GROWTH = 2, 2
 """Default limit of the splats: one for so many pixels of a picture, or so many times the first
 ones if more."""
@@ -227,10 +224,7 @@ def _fit(
         raise ValueError(str(error).replace("every:", "--hold-out:", 1)) from None
     shown = [] if test is None else [f"held_out/{stem}.png" for stem in file_stems(test.cameras)]
     check_inputs_stay((out / name for name in (*RESULTS, *shown)), dataset.image_paths)
-    largest = max(max(camera.width, camera.height) for camera in train.cameras)
-    if max_size is None and largest > (most := SIZES[device.partition(":")[0]]):
-        report.log(f"pictures of {largest} px are shrunk to {most} (--max-size {largest}: not)")
-        max_size = most
+    max_size = attnwarp.fit.views.shrunk_to(max_size, train.cameras, device, report)
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = None
     if test is not None:
@@ -271,6 +265,9 @@ def _fit(
     share = attnwarp.fit.without_surface(result.gaussians, views)
     if line := attnwarp.fit.say_without_surface(share):
         typer.echo(line)
+    seen = views if held_out is None else held_out
+    if line := attnwarp.fit.say_unlike(*attnwarp.fit.beside_mean_color(result.gaussians, seen)):
+        warn(line)
     return result
 
 

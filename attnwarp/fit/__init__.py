@@ -4,6 +4,7 @@ docs/method/fitting.md.
 
 from attnwarp.fit.exposure import read_exposures
 from attnwarp.fit.loop import Fit, Record, fit
+from attnwarp.fit.quality import beside_mean_color, say_unlike
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.sky import say_without_surface, with_sky, without_surface
 from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
@@ -15,6 +16,7 @@ __all__ = [
     "FitSettings",
     "Record",
     "Views",
+    "beside_mean_color",
     "compile_kernels",
     "extent_of",
     "first_splats",
@@ -24,6 +26,7 @@ __all__ = [
     "load_views",
     "random_points",
     "read_exposures",
+    "say_unlike",
     "say_without_surface",
     "with_sky",
     "without_surface",

@@ -24,6 +24,7 @@ from attnwarp.errors import InputWarning, suggest
 from attnwarp.io import Dataset, FileFormatError, read_image
 from attnwarp.io.file import is_file
 from attnwarp.io.images import read_mask, weighted_by_alpha
+from attnwarp.reporting import Reporter
 
 HELD_OUT_EVERY = 8
 """Interval of held-out images for a dataset without splits (LLFF's share)."""
@@ -34,6 +35,9 @@ HELD_BYTES = 2**31
 READ_BYTES = 2**29
 """Limit on the bytes of pictures kept in main memory, the rest being read again when drawn: 194 of
 1280 x 720 px, where an iteration takes 20 times as long as reading."""
+
+SIZES = {"cpu": 512, "cuda": 1600}
+"""Longest side in px of larger pictures in a fit by default: the editors' size, and 3DGS's."""
 
 SAME_POSE = 1e-6
 """Largest difference between two views that count as one, covering the rounding of printed poses:
@@ -252,6 +256,29 @@ def to_float(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
 
 def _top(image: npt.NDArray[Any]) -> float:
     return float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else 1.0
+
+
+def shrunk_to(
+    max_size: int | None, cameras: Sequence[Camera], device: str, report: Reporter
+) -> int | None:
+    """Choose the longest side of a fit's pictures in px, as asked or by default, and say so.
+
+    Args:
+        device: device of the fit, such as "cpu" or "cuda:1".
+
+    Example:
+        >>> from attnwarp.fit.views import shrunk_to
+        >>> from attnwarp.reporting import SILENT
+        >>> from attnwarp.trial import view
+        >>> shrunk_to(None, [view(side=4000)], "cpu", SILENT)
+        512
+    """
+    largest = max(max(camera.width, camera.height) for camera in cameras)
+    most = SIZES[device.partition(":")[0]]
+    if max_size is not None or largest <= most:
+        return max_size
+    report.log(f"pictures of {largest} px are shrunk to {most} (--max-size {largest}: not)")
+    return most
 
 
 def load_views(

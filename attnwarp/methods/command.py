@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,17 +19,20 @@ from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import announced
 from attnwarp.editing.segment import Mask, check_marks, segmenter_folders
 from attnwarp.editing.small import bundled, dtype_of, load_editor
-from attnwarp.errors import InputError, suggest
+from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.fit import (
     FitSettings,
     Views,
+    beside_mean_color,
     compile_kernels,
     first_splats,
     fit,
     load_views,
+    say_unlike,
     say_without_surface,
     without_surface,
 )
+from attnwarp.fit.views import shrunk_to
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, write_ply
 from attnwarp.io.find import FileFinder, name_key
@@ -142,7 +146,10 @@ def edit_dataset(
     editor.check_text(instruction)
     if settings.size is None:
         settings = settings.changed(size=editor.own_size)
-    views = load_views(dataset, max_size=options.max_size, exposures=exposures)
+    max_size = options.max_size
+    if splats is None:
+        max_size = shrunk_to(max_size, _with_picture(dataset), device, report)
+    views = load_views(dataset, max_size=max_size, exposures=exposures)
     if exposures:
         known = sum(change is not None for change in views.exposures)
         report.log(f"{known} of {len(views)} views have the exposure that the fit estimated")
@@ -312,6 +319,8 @@ def _fitted(
         result = fit(start, views, settings, folder=folder, report=report, stop=stop)
     if result.stopped == "asked":
         raise KeyboardInterrupt
+    if line := say_unlike(*beside_mean_color(result.gaussians, views)):
+        warnings.warn(line, InputWarning, stacklevel=2)
     return result.gaussians
 
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_scenes import cameras, pictures, splats
 
 from attnwarp import losses
-from attnwarp.fit import FitSettings, Views, fit, from_points
+from attnwarp.fit import FitSettings, Views, beside_mean_color, fit, from_points, say_unlike
 from attnwarp.fit.loop import SPLATS
 from attnwarp.io import read_ply
 from attnwarp.render import render
@@ -100,3 +101,23 @@ def test_splats_are_there_while_a_fit_runs(scene, tmp_path):
             begin(scene), scene[0], settings, folder=tmp_path, checkpoint_seconds=0, report=Killed()
         )
     assert len(read_ply(tmp_path / SPLATS)) == len(begin(scene))
+
+
+def test_splats_that_explain_less_than_half_of_their_pictures_are_told_as_such():
+    """Oracle: renders of the splats, of which each is blended with noise of a known variance."""
+    model, views = splats(), cameras()
+    shown, noise = pictures(model, views), np.random.default_rng(0)
+
+    def said(share):
+        blended = [
+            (1 - share) * image + share * noise.random(image.shape, np.float32) for image in shown
+        ]
+        psnr, plain = beside_mean_color(model, Views(views, blended))
+        error = np.mean([np.square(b - i).mean() for b, i in zip(blended, shown, strict=True)])
+        spread = np.mean([b.var(axis=(0, 1)).mean() for b in blended])
+        assert (psnr, plain) == pytest.approx(-10 * np.log10([error, spread]), abs=1e-3)
+        assert bool(say_unlike(psnr, plain)) == (error > spread / 2)
+        return say_unlike(psnr, plain)
+
+    assert not said(0.05)
+    assert "check that the cameras' poses belong to the pictures" in said(0.9)

@@ -148,9 +148,12 @@ def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_pat
     assert "f?r" in (tmp_path / "edit" / "index.html").read_text(encoding="utf-8")
 
 
-def test_without_splats_it_fits_them_first(place, tmp_path):
+def test_without_splats_it_fits_them_first_at_the_size_of_a_fit(place, tmp_path, monkeypatch):
+    monkeypatch.setattr("attnwarp.fit.views.SIZES", {"cpu": 24, "cuda": 24})
     result = run(place, tmp_path, "--fit-iterations", 5)
     assert result.exit_code == 0, result.output
+    assert "pictures of 32 px are shrunk to 24 (--max-size 32: not)" in result.stderr
+    assert read_image(tmp_path / "renders/before/v0.png").shape == (24, 24, 3)
     assert (tmp_path / "fit" / "splats.ply").is_file()
     assert (tmp_path / "edited.ply").is_file()
 
