@@ -53,7 +53,7 @@ def inspect(
         str,
         option(
             "picture, mask, rules, incidence; with truth: endpoint error, depth error,"
-            " covered by; of an edit: edit disagreement; of a run with labels: labels."
+            " covered by; of an edit: edit disagreement."
         ),
     ] = "mask",
     splats: Annotated[bool, option("Draw the splats as discs.")] = False,

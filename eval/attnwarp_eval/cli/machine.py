@@ -8,27 +8,21 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import metadata, util
-from pathlib import Path
 from typing import Literal
 
 from attnwarp.errors import EXTRAS, install_command
-from attnwarp.numba_cache import kernel_folder
 from attnwarp.process import core_count
 
 State = Literal["ok", "lack", "broken"]
 
 LONGEST = 120
 """Seconds after which a child process is given up."""
-
-WORKER_GB = 3
-"""Memory that a worker of a run needs at most."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +46,14 @@ def checks() -> Iterator[Check]:
     slow = (ray_casting, pictures, window, graphics_card, weights)
     with ThreadPoolExecutor(len(slow)) as pool:
         pending = [pool.submit(check) for check in slow]
-        for check in (versions, extras, threads, kernels, cache):
+        for check in (versions, extras, cache):
             yield check()
         for future in pending:
             yield future.result()
 
 
 def versions() -> Check:
-    """Python and this package."""
+    """Python, this package and those that figures depend on; cores."""
     from attnwarp_eval.cost import environment
 
     here = environment()
@@ -73,7 +67,7 @@ def versions() -> Check:
         "versions",
         "ok",
         f"attnwarp {metadata.version('attnwarp')} ({code}), Python {here['versions']['python']};"
-        f" {packages}",
+        f" {packages}; {core_count()} cores",
     )
 
 
@@ -96,50 +90,8 @@ def extras() -> Check:
     )
 
 
-def threads() -> Check:
-    """Cores and memory, and the workers that fit."""
-    cores = core_count()
-    free = _free_memory_gb()
-    jobs = max(1, min(cores, int(free / WORKER_GB)))
-    text = f"{cores} of {os.cpu_count()} cores, {free:.1f} GB of memory free"
-    advice = f"a run on workers: --jobs {jobs}"
-    if free < WORKER_GB:
-        return Check(
-            "threads and memory",
-            "lack",
-            text,
-            f"a worker needs up to {WORKER_GB} GB; less may end a run",
-            "close other programs, or lower the study's --size",
-        )
-    return Check("threads and memory", "ok", f"{text}; {advice}")
-
-
-def _free_memory_gb() -> float:
-    """Available memory, in GB."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable"))
-    return int(kilobytes) * 1024 / 1e9
-
-
-def kernels() -> Check:
-    """Check that the renderer's kernels are already compiled."""
-    spec = util.find_spec("attnwarp")
-    assert spec is not None and spec.submodule_search_locations
-    folder = Path(next(iter(spec.submodule_search_locations))) / "render" / "_kernels"
-    place = kernel_folder() or folder / "__pycache__"
-    if next(place.rglob("*.nbi"), None) is not None:
-        return Check("compiled kernels", "ok", f"in {place}")
-    return Check(
-        "compiled kernels",
-        "lack",
-        "none yet",
-        "the first render compiles for about a minute, once",
-        "none is needed",
-    )
-
-
 def cache() -> Check:
-    """The folder of derived files, and the space on its disk."""
+    """The folder of derived files."""
     from attnwarp.errors import InputError
     from attnwarp_eval import cache
 
@@ -149,26 +101,7 @@ def cache() -> Check:
     except InputError as error:
         return Check("cache", "broken", str(folder), str(error), "unset ATTNWARP_CACHE_GB")
     size = sum(size for _, size in cache.usage().values())
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    free = shutil.disk_usage(existing).free
-    text = f"{folder}: {size / 1e9:.2f} of {limit / 1e9:g} GB; {free / 1e9:.1f} GB free on its disk"
-    if not os.access(existing, os.W_OK):
-        return Check(
-            "cache",
-            "lack",
-            f"{text}; cannot be written to",
-            "every process makes meshes, splats and true pictures again",
-            "name another folder in ATTNWARP_CACHE",
-        )
-    if free + size < limit:
-        return Check(
-            "cache",
-            "lack",
-            text,
-            "the disk is full before the cache reaches its limit, and a run then stops",
-            f"a lower limit: ATTNWARP_CACHE_GB={max(1, int((free + size) / 2e9))}",
-        )
-    return Check("cache", "ok", text)
+    return Check("cache", "ok", f"{folder}: {size / 1e9:.2f} of {limit / 1e9:g} GB")
 
 
 def ray_casting() -> Check:
@@ -184,7 +117,7 @@ print("works" if abs(distance - 2) < 1e-5 else f"a distance of {distance}, expec
 """
     printed, problem = _child(program)
     if printed == "works":
-        return Check("exact geometry", "ok", f"Open3D {_version('open3d')} casts rays")
+        return Check("exact geometry", "ok", "Open3D casts rays")
     return Check(
         "exact geometry",
         "broken",
@@ -198,13 +131,8 @@ def pictures() -> Check:
     """Mitsuba, and the variant that renders."""
     from attnwarp_eval.truth import llvm
 
-    # llvm.variant() stores the working library in this variable.
     chosen = os.environ.get("ATTNWARP_MITSUBA")
     variant = llvm.variant()
-    version = _version("mitsuba")
-    if variant == llvm.LLVM:
-        library = os.environ.get("DRJIT_LIBLLVM_PATH", "Dr.Jit's own choice")
-        return Check("true pictures", "ok", f"Mitsuba {version}, {variant} with {library}")
     program = f"import mitsuba; mitsuba.set_variant({variant!r}); print(mitsuba.variant())"
     printed, problem = _child(program)
     if printed != variant:
@@ -215,52 +143,35 @@ def pictures() -> Check:
             f"no true picture can be made: {problem or printed}",
             f"apt install libatomic1, or again {install_command('eval')}",
         )
-    if chosen:
-        return Check("true pictures", "ok", f"Mitsuba {version}, {variant} by ATTNWARP_MITSUBA")
+    if variant == llvm.LLVM or chosen:
+        by = " by ATTNWARP_MITSUBA" if chosen else ""
+        return Check("true pictures", "ok", f"Mitsuba with {variant}{by}")
     return Check(
         "true pictures",
         "lack",
-        f"Mitsuba {version}, {variant}: no LLVM from {llvm.OLDEST} on works here",
+        f"Mitsuba with {variant}: no LLVM from {llvm.OLDEST} on works here",
         "true pictures take several times as long; their noise is another",
         "apt install libllvm19 (docs/truth/truth.md)",
     )
 
 
 def window() -> Check:
-    """PyVista, off screen and on."""
-    if util.find_spec("pyvista") is None:
-        return Check(
-            "3D window",
-            "lack",
-            "PyVista is not installed",
-            "attnwarp-eval inspect does not run",
-            install_command("inspect"),
-        )
+    """PyVista, off screen."""
     program = """
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
 plotter.add_mesh(pyvista.Sphere(), color="red")
-picture = plotter.screenshot(return_img=True)
-print(plotter.render_window.GetClassName(), int(picture.std() > 5))
+print(int(plotter.screenshot(return_img=True).std() > 5))
 """
     printed, problem = _child(program)
-    kind, _, drawn = printed.partition(" ")
-    if drawn != "1":
-        return Check(
-            "3D window",
-            "lack",
-            "PyVista draws nothing, even off screen",
-            f"attnwarp-eval inspect does not run: {problem or printed}",
-            "apt install libegl1 libgl1",
-        )
-    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        return Check("3D window", "ok", f"PyVista {_version('pyvista')} draws ({kind})")
+    if printed == "1":
+        return Check("3D window", "ok", "PyVista draws off screen; a window needs a display")
     return Check(
         "3D window",
         "lack",
-        f"PyVista {_version('pyvista')} draws off screen ({kind}); there is no display",
-        "attnwarp-eval inspect opens no window, and writes pictures with --screenshot",
-        "connect with ssh -X, or use a desktop",
+        "PyVista draws nothing",
+        f"attnwarp-eval inspect does not run: {problem or printed}",
+        f"{install_command('inspect')}; apt install libegl1 libgl1",
     )
 
 
@@ -268,72 +179,39 @@ def graphics_card() -> Check:
     """A GPU that torch and Warp can use."""
     program = """
 import json, torch
-names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-print(json.dumps([torch.__version__, torch.version.cuda, names]))
+print(json.dumps([torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]))
 """
     printed, problem = _child(program)
-    try:
-        version, cuda, names = json.loads(printed)
-    except ValueError:
-        return Check(
-            "GPU",
-            "broken",
-            "torch does not start",
-            f"nothing runs: {problem or printed}",
-            "install attnwarp again",
-        )
+    if problem:
+        return Check("GPU", "broken", "torch does not start", problem, "install attnwarp again")
+    names = json.loads(printed)
     if names and util.find_spec("warp") is not None:
-        found = f"{', '.join(names)}, CUDA {cuda}, Warp {_version('warp-lang')}"
-        return Check("GPU", "ok", f"{found}: splats lie on it with --device auto or cuda")
-    if names:
-        return Check(
-            "GPU",
-            "lack",
-            f"{', '.join(names)}, CUDA {cuda}, without Warp",
-            "splats are rendered on the processor; editors use the GPU",
-            install_command("gpu"),
-        )
-    driver = shutil.which("nvidia-smi") is not None
+        return Check("GPU", "ok", f"{', '.join(names)}: --device auto or cuda")
     return Check(
         "GPU",
         "lack",
-        f"none that torch {version} can use" + ("; a driver is installed" if driver else ""),
-        "studies run on the processor; large editors (Stable Diffusion) take minutes a view",
-        "install a CUDA build of torch" if driver else "none is needed for the studies that ship",
+        f"{', '.join(names)}, without Warp" if names else "none that torch can use",
+        "splats are rendered on the processor; without a GPU large editors take minutes a view",
+        install_command("gpu") if names else "none is needed for the studies that ship",
     )
 
 
 def weights() -> Check:
     """The bundled encoders and editors, against their checksums."""
     program = """
-import json
 from attnwarp.editing import small
 from attnwarp.encoders import BUNDLED, load_encoder
 for name in small.bundled():
     small.check_sums(small.WEIGHTS / name)
 for name in BUNDLED:
     load_encoder(name)
-print(json.dumps([*BUNDLED, *small.bundled()]))
+print(", ".join([*BUNDLED, *small.bundled()]))
 """
     printed, problem = _child(program)
-    try:
-        names = json.loads(printed)
-    except ValueError:
-        return Check(
-            "bundled weights",
-            "broken",
-            "damaged or missing",
-            problem or printed,
-            "install attnwarp again",
-        )
-    return Check("bundled weights", "ok", f"{', '.join(names)}: every checksum fits")
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
+    if problem:
+        remedy = "install attnwarp again"
+        return Check("bundled weights", "broken", "damaged or missing", problem, remedy)
+    return Check("bundled weights", "ok", f"{printed}: every checksum fits")
 
 
 def _child(program: str) -> tuple[str, str]:

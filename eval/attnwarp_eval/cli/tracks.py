@@ -9,7 +9,6 @@ import typer
 
 from attnwarp.cli.files import read_splats, read_views
 from attnwarp.cli.options import DataArgument, Reading, option, options_of
-from attnwarp.cli.shell import log
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import clear_errors
 
@@ -35,10 +34,6 @@ def tracks(
     truth: Annotated[
         str | None, option("The scene that DATA is an export of: exact geometry.", "SCENE")
     ] = None,
-    halve: Annotated[
-        Path | None,
-        option("Write DATA there with half of the points to fit from; the others judge.", "FOLDER"),
-    ] = None,
     out: Annotated[Path, option("Folder for tracks.json and tracks.html.")] = Path("runs/tracks"),
     *,
     reading: Reading,
@@ -61,19 +56,11 @@ def tracks(
         presets = preset or ["paper", "corrected"]
         for name in presets:
             check.one_of(name, list(PRESETS), "--preset")
-        if not ply and halve is None:
-            raise InputError("--ply: expected splats to judge, or --halve FOLDER to prepare a fit")
+        if not ply:
+            raise InputError("--ply: expected splats to judge")
         dataset = read_views(data, reading)
         dataset = dataset.select([k for k, path in enumerate(dataset.image_paths) if path])
         found = find.find_tracks(data, dataset, out / find.FILE, model=model, report=report)
-        if halve is not None:
-            count = find.halve(dataset, found, halve)
-            log(
-                f"{halve}: {count} of {len(found.started)} points to begin from; attnwarp fit"
-                f" {halve} --out FIT, then attnwarp-eval tracks {halve} --ply FIT/splats.ply"
-            )
-        if not ply:
-            return
         views = load_views(dataset, max_size=max_size)
         page = written.Page(out, views, found.resized(dataset.cameras, views.cameras))
         for path in ply:

@@ -48,7 +48,6 @@ class CellReport:
         taps: source cells read, with their weights.
         label: label of the truth on this grid, "" without truth.
         true_xy: (2,) exact position in cells; NaN without truth.
-        token: description of the carried label; "" if no run has labels.
     """
 
     column: int
@@ -64,7 +63,6 @@ class CellReport:
     taps: tuple[Tap, ...]
     label: str
     true_xy: Vector
-    token: str = ""
 
     def lines(self) -> list[str]:
         """Text lines of the report."""
@@ -86,7 +84,7 @@ class CellReport:
         ]
         text.append(f"mask: {self.share:.3f} of the cell's pixels, above 0.5 counts")
         text.append("gets features" if self.accepted else "keeps its own")
-        return [*text, self.token] if self.token else text
+        return text
 
 
 def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
@@ -111,7 +109,7 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
     source, target = correspondence.source, correspondence.target
     depth = float(correspondence.target_depth[cell])
     centre = np.array([column + 0.5, row + 0.5])
-    truth, carried = pair.truth_at(size), pair.carried(size)
+    truth = pair.truth_at(size)
     return CellReport(
         column=column,
         row=row,
@@ -126,7 +124,6 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
         taps=_taps(pair, size, cell, source.height, source.width),
         label="" if truth is None else LABELS[int(truth.label[cell])],
         true_xy=np.full(2, np.nan) if truth is None else truth.xy[cell],
-        token="" if carried is None else carried.text(row, column),
     )
 
 

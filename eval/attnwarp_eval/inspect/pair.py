@@ -35,7 +35,6 @@ from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 if TYPE_CHECKING:
-    from attnwarp_eval.study.probe import Carried, TokenLabels
     from attnwarp_eval.world import World
 
 Array = npt.NDArray[np.float64]
@@ -47,8 +46,6 @@ LABELS = {NONE: "none", VISIBLE: "visible", HIDDEN: "hidden", AMBIGUOUS: "ambigu
 
 EDIT_DISAGREEMENT = "edit disagreement"
 
-PART_LABELS = "labels"
-
 COLORINGS = (
     "picture",
     "mask",
@@ -58,7 +55,6 @@ COLORINGS = (
     "incidence",
     "covered by",
     EDIT_DISAGREEMENT,
-    PART_LABELS,
 )
 """Colourings of the target's surface; :attr:`Pair.colorings` has those that a pair can show."""
 
@@ -104,7 +100,6 @@ class Pair:
         views: a scene with truth, or a user's capture.
         model: the splats that give depth; None takes the true depth.
         exact_mask: whether the mask is the exact one, as for an oracle.
-        labels: labels of tokens that a probe of a run follows.
     """
 
     views: World | Capture
@@ -114,7 +109,6 @@ class Pair:
     spp: int = 8
     edit: Edit | RunEdit | None = None
     exact_mask: bool = False
-    labels: TokenLabels | None = None
 
     @property
     def world(self) -> World | None:
@@ -362,8 +356,7 @@ class Pair:
             sides = (target.height, target.width, source.height, source.width)
             if all(side % factor == 0 for side in sides) and min(sides) >= 2 * factor:
                 sizes.append((target.height // factor, target.width // factor))
-        own = () if self.labels is None else self.labels.grids
-        return tuple(sorted({*sizes, *((g, g) for g in own if g != target.height)}, reverse=True))
+        return tuple(sorted(sizes, reverse=True))
 
     def layer(self, size: Size) -> FeatureWarp:
         """The warp of an (h, w) feature grid."""
@@ -375,12 +368,6 @@ class Pair:
             return self.view.mask.numpy()
         return blocks(self.layer(layer).mask.numpy(), self.size)
 
-    def carried(self, layer: Size | None = None) -> Carried | None:
-        """Labels carried on a feature grid, or by pixels; None if no run has any."""
-        if self.labels is None or self.truth is None:
-            return None
-        return self.labels.carried(self.layer(layer or self.size), self.target, self.truth)
-
     # --- colours
 
     @property
@@ -391,7 +378,6 @@ class Pair:
             for name in COLORINGS
             if (self.truth is not None or name not in NEEDS_TRUTH)
             and (self.edit is not None or name != EDIT_DISAGREEMENT)
-            and (self.labels is not None or name != PART_LABELS)
         )
 
     def colors(self, coloring: str, layer: Size | None = None, step: str | None = None) -> Image:
@@ -399,7 +385,7 @@ class Pair:
 
         Args:
             coloring: one of :attr:`colorings`.
-            layer: (h, w) of a feature grid, whose mask or tokens "mask" and "labels" then show.
+            layer: (h, w) of a feature grid, whose mask "mask" then shows.
             step: step of the edit, whose scene "picture" then shows.
         """
         if coloring not in self.colorings:
@@ -420,11 +406,6 @@ class Pair:
             return incidence_map(self.incidence)
         if coloring == EDIT_DISAGREEMENT:
             return disagreement_map(self.disagreement)
-        if coloring == PART_LABELS:
-            carried = self.carried(layer)
-            assert carried is not None and self.labels is not None
-            colors = [color for _, color in self.labels.legend]
-            return tinted(colors, blocks(carried.kind, self.size), target)
         assert truth is not None
         if coloring == "endpoint error":
             return pictures.endpoint_map(self.view.correspondence.xy.numpy(), truth)
@@ -445,8 +426,6 @@ class Pair:
                 for number, rule in enumerate(self.view.rules)
             ]
             return [("accepted", ACCEPTED), *rules]
-        if coloring == PART_LABELS:
-            return [] if self.labels is None else [*self.labels.legend]
         if coloring == "covered by":
             views = zip(self._covering_views(), CATEGORIES, strict=False)
             return [*views, ("no view", REJECTED)]

@@ -31,7 +31,6 @@ from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
 
 if TYPE_CHECKING:
-    from attnwarp_eval.study.probe import TokenLabels
     from attnwarp_eval.world import World
 
 SIZE = 512
@@ -59,7 +58,6 @@ class Subject:
             it.
         elsewhere: advice on the file to open for an edited view without pictures in the run; empty
             except for a run of edits.
-        labels: labels of tokens that a probe of a run follows; None without one.
     """
 
     scene: str
@@ -72,7 +70,6 @@ class Subject:
     edit: Edit | None = field(default=None, repr=False)
     measured: Mapping[str, Measured] = field(default_factory=dict, repr=False)
     elsewhere: str = ""
-    labels: TokenLabels | None = field(default=None, repr=False)
     _pairs: dict[tuple[str, str], Pair] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -116,7 +113,6 @@ class Subject:
             self.spp,
             own.edits.get(target),
             own.exact_mask,
-            self.labels,
         )
 
     @property
@@ -184,7 +180,6 @@ def of_run(
         InputError: the folder is not a run, a record is damaged, the run has no such scene or seed
             or no variants, or the scene has changed since.
     """
-    from attnwarp_eval.study.probe import probe
     from attnwarp_eval.study.run import stored_study
     from attnwarp_eval.study.study import scene_files
     from attnwarp_eval.world import world
@@ -219,7 +214,6 @@ def of_run(
     if any(own.edited for own in records.values()):
         elsewhere = _elsewhere(folder, pictured, edited)
     scene, seen = files[name], tuple(study.views or views.targets)
-    followed = (probe(each).token_labels(study, views, seen) for each in study.probes)
     return Subject(
         scene,
         size,
@@ -229,7 +223,6 @@ def of_run(
         (*edited, *seen),
         measured=records,
         elsewhere=elsewhere,
-        labels=next(filter(None, followed), None),
     )
 
 

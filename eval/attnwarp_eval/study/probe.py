@@ -20,12 +20,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from attnwarp.warp import FeatureWarp
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
@@ -35,7 +31,6 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study, Variant
-from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 
 E = TypeVar("E", bound=Extra)
@@ -60,32 +55,6 @@ class InTurn:
     rounds: int
     threads: int
     of: str
-
-
-class Carried(Protocol):
-    """Labels of a grid's tokens, carried along a warp."""
-
-    @property
-    def kind(self) -> npt.NDArray[np.int64]:
-        """(h, w) index into :attr:`TokenLabels.legend`, -1 for its last entry."""
-
-    def text(self, row: int, column: int) -> str:
-        """Description of the label at a token."""
-
-
-class TokenLabels(Protocol):
-    """Labels of tokens that a probe follows along warps, as ``inspect`` shows them."""
-
-    @property
-    def grids(self) -> Sequence[int]:
-        """Sides of the token grids."""
-
-    @property
-    def legend(self) -> Sequence[tuple[str, str]]:
-        """Text and colour of each kind of token; the last entry is for all others."""
-
-    def carried(self, layer: FeatureWarp, target: str, truth: TwoView) -> Carried:
-        """Labels of a target's tokens, carried along the warp of their grid."""
 
 
 @dataclass
@@ -250,12 +219,6 @@ class Probe(ABC, Generic[E]):
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Key that two variants share if they mean the same to a claim about this probe."""
         return variant.settings(), variant.geometry, study.splats_of(variant)
-
-    def token_labels(
-        self, study: Study, world: World, targets: Sequence[str]
-    ) -> TokenLabels | None:
-        """Labels of tokens that ``inspect`` shows for a run; None for a probe without any."""
-        return None
 
     # From a cell to its record
 

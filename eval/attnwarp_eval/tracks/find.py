@@ -16,7 +16,7 @@ import numpy.typing as npt
 from attnwarp import sfm
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
-from attnwarp.io import Dataset, write_transforms
+from attnwarp.io import Dataset
 from attnwarp.io.colmap import find_model
 from attnwarp.io.images import read_image
 from attnwarp.reporting import SILENT, Reporter
@@ -144,28 +144,6 @@ def write(tracks: Tracks, path: Path, key: str = "") -> None:
     buffer = io.BytesIO()
     np.savez(buffer, key=key, **{name: value for name, value in vars(tracks).items()})
     write_atomic(path, buffer.getvalue())
-
-
-def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
-    """Write a capture again with every second point of the tracks as a fit's initial points, and
-    its tracks.npz next to it; return the number of points.
-
-    Pictures are not copied. Splats fitted to this capture have not seen the other points.
-    """
-    points = world_points(tracks, dataset.cameras)
-    started = (np.arange(len(points)) % 2 == 0) & np.isfinite(points).all(axis=1)
-    colors = np.zeros((len(points), 3), dtype=np.uint8)
-    for k, path in enumerate(dataset.image_paths):
-        assert path is not None
-        rows = np.flatnonzero(tracks.image == k)
-        image = _eight_bits(path)
-        x, y = np.floor(tracks.xy[rows]).astype(int).T
-        inside = np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)
-        colors[tracks.point[rows]] = image[inside]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_transforms(folder, replace(dataset, points=points[started], colors=colors[started]))
-    write(replace(tracks, started=started), folder / FILE)
-    return int(started.sum())
 
 
 # --------------------------------------------------------------------------------------------------

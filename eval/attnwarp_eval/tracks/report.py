@@ -13,12 +13,11 @@ import numpy as np
 from attnwarp.errors import InputError
 from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
-from attnwarp.io.picture import encode_picture
 from attnwarp.methods.scene import near_of
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.cost import environment
-from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.scene.file import load_scene
@@ -43,8 +42,6 @@ BLIND = (
     " those, and nothing of hidden surface that a mask accepts. Poses and pictures are those that"
     " the splats were fitted to."
 )
-
-COLORS = "Green within 1 px, yellow within 2, red beyond; a ring where the mask drops the point."
 
 COLUMNS = ["splats", "preset", "apart", "pairs", "points", "angle"]
 
@@ -151,8 +148,7 @@ def _plain(value: float) -> str:
 
 
 class Page:
-    """Report of splats fitted to one capture, written as tracks.json, as a page, and as a picture
-    for each splats and preset.
+    """Report of splats fitted to one capture, written as tracks.json and as a page.
 
     Args:
         folder: output folder.
@@ -163,7 +159,6 @@ class Page:
     def __init__(self, folder: Path, views: Views, tracks: Tracks) -> None:
         self.folder, self.views, self.tracks = folder, views, tracks
         self.rows: list[Row] = []
-        self.pictures: dict[str, Path] = {}
 
     def add(
         self,
@@ -174,7 +169,7 @@ class Page:
         truth: str | None = None,
         report: Reporter = SILENT,
     ) -> None:
-        """Measure splats, and draw a target picture for each preset.
+        """Measure splats under each preset.
 
         Args:
             path: path of the splats. Its folder names them; views of the folder's ``held_out`` were
@@ -204,11 +199,6 @@ class Page:
                     f"--apart: no pair of views has {LEAST} points in common; take nearer ones"
                 )
             self.rows += rows_of(label, name, pairs)
-            pair = pairs[len(pairs) // 2]
-            image = self.folder / "pictures" / f"{label}-{name}.png"
-            shown = self.views.target(pair.target, np.zeros(3)).numpy()
-            draw(pair, self.tracks, shown, image)
-            self.pictures[f"{label}, {name}: {Path(cameras[pair.target].name).name}"] = image
 
     def write(self, inputs: Mapping[str, Any]) -> list[Path]:
         """Write tracks.json, with the command's inputs, and the page; return their paths."""
@@ -218,9 +208,7 @@ class Page:
             f" {camera.width} x {camera.height} px."
         ]
         if not started.any():
-            notes.append(
-                "The fit may have begun from these points; --halve keeps half of them from it."
-            )
+            notes.append("The fit may have begun from these points.")
         data = {
             "format": FORMAT,
             "inputs": dict(inputs),
@@ -243,24 +231,4 @@ class Page:
                 ["The same points against exact geometry, then every pixel."],
                 [Table([*COLUMNS, *EXACT.values()], cells)],
             )
-        shown = [
-            Picture(path.relative_to(self.folder).as_posix(), text)
-            for text, path in self.pictures.items()
-        ]
-        yield Section("Points of a pair", [COLORS], gallery=Gallery([("", shown)]))
         yield Section("How to read this", [READING, BLIND])
-
-
-def draw(pair: Pair, tracks: Tracks, image: np.ndarray[Any, Any], path: Path) -> None:
-    """Draw the target, (H, W, 3) sRGB in [0, 1], with a pair's points coloured by their error."""
-    import cv2
-
-    scale = max(1, round(512 / max(image.shape[:2])))
-    large = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
-    canvas = np.ascontiguousarray(np.round(255 * large).astype(np.uint8))
-    _, at = tracks.shared(pair.source, pair.target)
-    for xy, error, kept in zip(tracks.xy[at], pair.error, pair.kept, strict=True):
-        color = (40, 200, 60) if error <= 1 else (250, 210, 30) if error <= OFF else (235, 40, 40)
-        center = tuple(int(v) for v in np.round(xy * scale))
-        cv2.circle(canvas, center, 5, color, -1 if kept else 2, cv2.LINE_AA)
-    write_atomic(path, encode_picture(canvas / 255))

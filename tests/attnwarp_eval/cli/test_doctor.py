@@ -57,23 +57,12 @@ def test_lines_fit_a_terminal_of_80_columns():
     assert text.startswith("lack   3D window: a rather") and "\n         remedy: a rather" in text
 
 
-def test_a_cache_that_is_larger_than_its_disk_is_a_lack(tmp_path, monkeypatch):
+def test_a_limit_of_the_cache_that_is_no_number_is_broken(tmp_path, monkeypatch):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "not" / "yet"))
     monkeypatch.setenv("ATTNWARP_CACHE_GB", "0.001")
     assert machine.cache().state == "ok"
-    free = os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize
-    monkeypatch.setenv("ATTNWARP_CACHE_GB", str(2 * free / 1e9))
-    assert machine.cache().state == "lack"
     monkeypatch.setenv("ATTNWARP_CACHE_GB", "many")
     assert machine.cache().state == "broken"
-
-
-def test_kernels_that_were_never_compiled_are_a_lack(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert machine.kernels().state == "lack"
-    (tmp_path / "module").mkdir()
-    (tmp_path / "module" / "kernel.nbi").touch()
-    assert machine.kernels().state == "ok"
 
 
 def test_a_child_that_aborts_or_prints_nonsense_is_an_answer():

@@ -13,13 +13,10 @@ from attnwarp.warp import PRESETS
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.inspect import subject
-from attnwarp_eval.inspect.cell import cell_report
 from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.inspect.window import Window
-from attnwarp_eval.study import parse_study
 from attnwarp_eval.study.probes.editing.result import EditResult, Judgement
-from attnwarp_eval.study.run import execute, plan
-from attnwarp_eval.study.shared.pictures import jpeg, rgb
+from attnwarp_eval.study.shared.pictures import jpeg
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.world import world
 
@@ -184,41 +181,6 @@ def test_a_run_without_edits_is_not_shown_on_a_scene_that_has_changed(tmp_path):
             continue
         with pytest.raises(InputError, match="'spheres' has changed since the run was made"):
             subject.of_run(store.root)
-
-
-def test_tokens_of_a_drawn_scene_are_coloured_as_the_run_counted_them(tmp_path):
-    """Oracle: the counts and shares of the run's own record, and a cell's line against its colour."""
-    study = parse_study({
-        "name": "carried",
-        "scenes": {"drawn": 1, "generator": 1, "seed": 41},
-        "size": SIZE,
-        "spp": 1,
-        "views": ["yaw030", "yaw060"],
-        "splats": {"count": 2000},
-        "labels": {"grids": [8, 16], "parts": [6, 9]},
-        "variants": {"bounds": {"set": {"depth_agreement": False, "normal_test": "none"}}},
-        "probes": {"labels": ["bounds"]},
-    })  # fmt: skip
-    store = Store(tmp_path / "run")
-    execute(plan(study, store), store)
-    records = map(store.read, store.done())
-    (record,) = [one for one in records if one["spec"]["probe"] == "labels"]
-    opened = subject.of_run(store.root, scene="drawn-0")
-    legend = opened.pair("bounds", "yaw030").legend("labels")
-    colored = 0
-    for view in record["views"]:
-        pair = opened.pair("bounds", view["view"])
-        grey = 0.35 * pair.images[1].mean(axis=2, keepdims=True)
-        for grid in (8, 16):
-            assert (grid, grid) in pair.layers
-            tints = (pair.colors("labels", (grid, grid)) - grey)[:: SIZE // grid, :: SIZE // grid]
-            for (name, among), (_, color) in zip(KINDS, legend, strict=False):
-                share, of = (view["metrics"][f"labels.{k}.{grid}.6"] for k in (name, among))
-                count = np.isclose(tints, 0.65 * rgb(color), atol=1e-6).all(axis=-1).sum()
-                assert count == (round(share * of) if of else 0), (name, grid)
-                colored += int(count)
-    assert colored > 20
-    assert cell_report(pair, (16, 16), 8, 8).lines()[-1].startswith("label: ")
 
 
 @pytest.mark.door

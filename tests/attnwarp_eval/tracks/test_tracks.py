@@ -16,7 +16,7 @@ from attnwarp import Camera, Gaussians
 from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.scene.shapes import Rectangle
-from attnwarp_eval.tracks.find import Tracks, halve, world_points
+from attnwarp_eval.tracks.find import Tracks, world_points, write
 from attnwarp_eval.tracks.measure import OFF, measure, summarise
 from attnwarp_eval.truth import Geometry
 
@@ -172,12 +172,15 @@ def test_points_that_a_fit_begins_with_are_not_judged(tmp_path):
     paths = [tmp_path / f"{k}.png" for k in range(3)]
     for path in paths:
         cv2.imwrite(str(path), np.full((48, 64, 3), 90, np.uint8))
-    assert halve(Dataset(CAMERAS, paths), tracks, tmp_path / "half") == 10
+    half = tmp_path / "half"
+    half.mkdir()
+    write_transforms(half, Dataset(CAMERAS, paths))
+    write(replace(tracks, started=np.arange(20) % 2 == 0), half / "tracks.npz")
     splats = tmp_path / "splats.ply"
     write_ply(splats, disc((0, 0, 0), FLAT, 30))
     done = CliRunner().invoke(
         app,
-        ["tracks", str(tmp_path / "half"), "--ply", str(splats), "--out", str(tmp_path / "out")],
+        ["tracks", str(half), "--ply", str(splats), "--out", str(tmp_path / "out")],
     )
     assert done.exit_code == 0, done.output
     rows = json.loads((tmp_path / "out/tracks.json").read_text())["rows"]
@@ -193,7 +196,7 @@ def test_bad_input_is_one_line(tmp_path):
     for options, word in (
         ([], "--ply"),
         (["--ply", "x.ply", "--preset", "none"], "--preset"),
-        (["--halve", str(tmp_path / "h")], "tracks.npz"),
+        (["--ply", "x.ply"], "tracks.npz"),
     ):
         done = CliRunner().invoke(app, ["tracks", str(tmp_path), *options])
         assert done.exit_code == 2 and word in done.output, done.output

@@ -21,14 +21,12 @@ from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.shared.warps import WarpProbe, warp_truth, warped_views
 from attnwarp_eval.two_view import TwoView
-from attnwarp_eval.world import World
 from attnwarp_lab.ideal.edges import PLACES, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.labels import Labels as LabelMap
 from attnwarp_lab.ideal.labels import Mask, carried_labels, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
-from attnwarp_lab.probes.labels.inspected import Parts
 
 GRIDS = (8, 16, 32, 64)
 """Default sides of the token grids."""
@@ -109,17 +107,6 @@ class LabelTransport(WarpProbe):
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Key of the depth, the rules and the control."""
         return *super().meaning(study, variant), variant.part(VariantPart).control
-
-    def token_labels(self, study: Study, world: World, targets: Sequence[str]) -> Parts:
-        """Labels for the first number of parts."""
-        size = world.source.width
-        return Parts(
-            world,
-            (world.source.name, *targets),
-            tuple(thing_of(study, world.scene)),
-            study.part(StudyPart).labels.parts[0],
-            tuple(grid for grid in grids_of(study, size) if size % grid == 0),
-        )
 
     def compute(self, work: Work) -> NoExtra:
         """Warp, carry and count, view by view."""
