@@ -56,8 +56,9 @@ def records(run):
 
 
 def made(run):
-    """Files of all cells but for the pages, which tell seconds."""
-    return {k: v for k, v in files(run / "made").items() if not k.endswith("index.html")}
+    """Files of all cells but for the pages, which tell seconds, and the locks, which tell a process."""
+    told = ("index.html", ".lock")
+    return {k: v for k, v in files(run / "made").items() if not k.endswith(told)}
 
 
 def test_a_run_that_was_killed_half_way_gives_the_same_bytes(folder, run):
