@@ -177,10 +177,10 @@ def environment() -> dict[str, Any]:
     """Versions, machine and source revision: all that is needed to reproduce a figure."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
+        versions[name] = "not installed"
+        for package in (name, f"{name}-cpu"):  # the build of Open3D without CUDA
+            with suppress(metadata.PackageNotFoundError):
+                versions[name] = metadata.version(package)
     return {
         "versions": versions,
         "machine": {
