@@ -260,14 +260,12 @@ def fitting(device: str, sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = False) -> Any:
-    """An InstructPix2Pix of Stable Diffusion 1.5's sizes with random weights, or a depth
-    ControlNet."""
-    from diffusers import AutoencoderKL, ControlNetModel, DDIMScheduler, UNet2DConditionModel
+def random_editor(device: str, sizes: Sizes, dtype: torch.dtype) -> Any:
+    """An InstructPix2Pix of Stable Diffusion 1.5's sizes with random weights."""
+    from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from diffusers.utils import logging
     from transformers import CLIPTextConfig, CLIPTextModel
 
-    from attnwarp.editing.editors.controlnet import DepthControlNet
     from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.editing.small import load_editor
 
@@ -277,7 +275,7 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = F
     torch.manual_seed(0)
     levels = len(sizes.channels)
     unet = UNet2DConditionModel(
-        sample_size=64, in_channels=4 if depth else 8, out_channels=4,
+        sample_size=64, in_channels=8, out_channels=4,
         block_out_channels=sizes.channels,
         down_block_types=(*["CrossAttnDownBlock2D"] * (levels - 1), "DownBlock2D"),
         up_block_types=("UpBlock2D", *["CrossAttnUpBlock2D"] * (levels - 1)),
@@ -302,10 +300,7 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = F
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False,
         set_alpha_to_one=False, steps_offset=1,
     )  # fmt: skip
-    if not depth:
-        return InstructPix2Pix(unet, vae, text, tokenizer, scheduler)
-    control = ControlNetModel.from_unet(unet).to(device, dtype)
-    return DepthControlNet(unet, vae, text, tokenizer, scheduler, control)
+    return InstructPix2Pix(unet, vae, text, tokenizer, scheduler)
 
 
 def editing(

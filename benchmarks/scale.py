@@ -5,16 +5,12 @@ The cells compute nothing, so that only this is measured. Every step runs in a p
 whose seconds and peak memory are read at its end.
 
     python -m benchmarks.scale --cells 1000 10000 100000 --out reports/scale/report.md
-    python -m benchmarks.scale --cluster 2000      # a dask scheduler and two workers
-    python -m benchmarks.scale --cluster 200 --wait 0.25   # cells that take as long as real ones
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-import os
 import shutil
 import subprocess
 import sys
@@ -24,7 +20,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from attnwarp.reporting import Reporter
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import peak_memory_mb
 from attnwarp_eval.files import write_atomic
@@ -40,16 +35,13 @@ FIGURES = ("depth.abs_rel", "depth.bias_relative", "depth.coverage")
 
 
 class VariantPart(Part):
-    """Key that tells the variants apart, and the seconds that their cells wait, as if they
-    worked.
-    """
+    """Key that tells the variants apart."""
 
     level: int = 0
-    wait: float = 0.0
 
 
 class Free(Probe[NoExtra]):
-    """Figures that follow from the cell's id and cost nothing but a wait, if one is asked for."""
+    """Figures that follow from the cell's id and cost nothing."""
 
     name = "free"
     variant_part = VariantPart
@@ -58,9 +50,8 @@ class Free(Probe[NoExtra]):
     contrasts = FIGURES
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The variant's level, and its wait if it has one."""
-        own = variant.part(VariantPart)
-        return {"level": own.level} | ({"wait": own.wait} if own.wait else {})
+        """The variant's level."""
+        return {"level": variant.part(VariantPart).level}
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """The variant's level."""
@@ -68,7 +59,6 @@ class Free(Probe[NoExtra]):
 
     def compute(self, work: Work) -> NoExtra:
         """Figures in [0, 1) out of the hash of the cell and the view."""
-        time.sleep(work.spec.get("wait", 0.0))
         for view in work.spec["views"]:
             with work.meter.view():
                 digits = digest([work.cell.id, view])
@@ -78,8 +68,8 @@ class Free(Probe[NoExtra]):
         return NoExtra()
 
 
-def study_of(cells: int, wait: float = 0.0) -> Study:
-    """A study of about so many cells, which wait so many seconds: variants and seeds grow alike."""
+def study_of(cells: int) -> Study:
+    """A study of about so many cells: variants and seeds grow alike."""
     side = max(2, round((cells / len(SCENES)) ** 0.5))
     names = [f"level {level}" for level in range(side)]
     return parse_study(
@@ -91,7 +81,7 @@ def study_of(cells: int, wait: float = 0.0) -> Study:
             "scenes": SCENES,
             "views": [],
             "seeds": list(range(max(1, round(cells / len(SCENES) / side)))),
-            "variants": {name: {"level": level, "wait": wait} for level, name in enumerate(names)},
+            "variants": {name: {"level": level} for level, name in enumerate(names)},
             "probes": {"free": names},
             "ablations": [
                 {"title": "Levels", "probe": "free", "baseline": names[0], "variants": names[1:]}
@@ -214,116 +204,26 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-WORKERS = 2
-"""Workers of the cluster."""
-
-
-def cluster(cells: int, folder: Path, wait: float = 0.0) -> str:
-    """CPU milliseconds a cell of the command, of the scheduler and of the workers.
-
-    What the command and the scheduler need for a cell bounds how many workers they can feed. Where
-    cells wait, their seconds over those of the workers is the efficiency.
-    """
-    import psutil
-
-    from attnwarp_eval.study.run import execute, plan
-
-    file = folder / "scheduler.json"
-    dask = [sys.executable, "-m", "dask"]
-    place = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    options = ["--nthreads", "1", "--no-nanny", "--memory-limit", "0", "--no-dashboard"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    processes = [
-        subprocess.Popen(
-            [*dask, "scheduler", *place, "--scheduler-file", str(file)], stderr=subprocess.DEVNULL
-        )
-    ]
-    try:
-        for number in range(WORKERS):
-            local = ["--local-directory", str(folder / f"worker{number}")]
-            processes.append(
-                subprocess.Popen(
-                    [*dask, "worker", "--scheduler-file", str(file), *options, *local],
-                    stderr=subprocess.DEVNULL,
-                    env=environment,
-                )
-            )
-        store = Store(folder / "cluster")
-        planned = plan(study_of(cells, wait), store)
-        before = [0.0] * (2 + WORKERS)
-        start = 0.0
-        warm = cells // 4
-
-        class Clock(Reporter):
-            def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
-                nonlocal before, start
-                if done == warm and not start:
-                    before, start = _cpu(processes, psutil), time.perf_counter()
-
-        while not file.is_file():
-            time.sleep(0.1)
-        summary = execute(planned, store, scheduler=str(file), report=Clock())
-        wall = time.perf_counter() - start
-        used = [b - a for a, b in zip(before, _cpu(processes, psutil), strict=True)]
-        assert summary.complete, summary.failures[:1]
-    finally:
-        for process in processes:
-            process.terminate()
-            process.wait()
-    names = ["the command", "the scheduler", *(f"worker {k + 1}" for k in range(WORKERS))]
-    count = summary.computed - warm
-    size = sum(p.stat().st_size for p in store.cells.rglob("*.json")) / summary.computed
-    lines = ["| process | CPU ms a cell |", "|---|---|"]
-    lines += [
-        f"| {name} | {1000 * seconds / count:.1f} |"
-        for name, seconds in zip(names, used, strict=True)
-    ]
-    about = f"{count} cells, records of {size / 1000:.1f} kB, {count / wall:.1f} cells a second."
-    if wait:
-        about += (
-            f" Each waits {wait:g} s: with {WORKERS} workers the efficiency is"
-            f" {count * wait / WORKERS / wall:.0%}."
-        )
-    return "\n".join([*lines, "", about])
-
-
-def _cpu(processes: Sequence[subprocess.Popen[bytes]], psutil: Any) -> list[float]:
-    """CPU seconds so far of this process, and of the others."""
-    times = [psutil.Process(p.pid).cpu_times() for p in processes]
-    return [time.process_time(), *(t.user + t.system for t in times)]
-
-
 def main() -> None:
     """Measure, print, and write where ``--out`` says."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, nargs="+", default=[1000])
-    parser.add_argument("--cluster", type=int, help="cells on a cluster, instead of the steps")
-    parser.add_argument(
-        "--wait", type=float, default=0.0, help="seconds that each cell of --cluster waits (0)"
-    )
     parser.add_argument("--out", type=Path, help="Markdown file of the table")
     parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--folder", type=Path, help="where the runs are made; a new one if left out"
     )
     arguments = parser.parse_args()
-    if not 0 <= arguments.wait < math.inf:
-        parser.error(f"--wait: got {arguments.wait:g}, expected seconds from 0 on")
-    if arguments.wait and not arguments.cluster:
-        parser.error("--wait: cells wait on a cluster alone; add --cluster CELLS")
     register(Free)
     if arguments.step:
         print(json.dumps(one_step(arguments.step, arguments.cells[0], arguments.folder)))
         return
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         rows: list[Row] = []
-        if arguments.cluster:
-            text = cluster(arguments.cluster, Path(folder), arguments.wait)
-        else:
-            for row in measure(arguments.cells, Path(folder)):
-                print(*row, flush=True)
-                rows.append(row)
-            text = table(rows)
+        for row in measure(arguments.cells, Path(folder)):
+            print(*row, flush=True)
+            rows.append(row)
+    text = table(rows)
     print(text)
     if arguments.out:
         write_atomic(arguments.out, (text + "\n").encode())
@@ -333,7 +233,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # Not __main__.Free: workers of a cluster must be able to import the probe.
-    from benchmarks import scale
-
-    scale.main()
+    main()
