@@ -3,12 +3,13 @@
 Every warp along depth assumes that an edited picture lies where its original lay. Tiles of both
 pictures are aligned by Lucas-Kanade with a gain and an offset of each tile, so that changes of
 colour, light and blur do not count; the similarity that most tiles share is the drift. Repainted
-tiles disagree and drop out.
+tiles disagree and drop out. A stretched or sheared picture is told apart by an affine map of the
+same tiles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
+from scipy.linalg import eigh, expm, logm
 from scipy.special import stdtrit
 
 Floats = npt.NDArray[Any]
@@ -37,6 +39,18 @@ Unrelated pictures and neighbouring views of a capture reach 0.25 at most."""
 FLOOR = np.array([0.03, 0.03, 3e-4, 3.5e-4])
 """Half widths (px at the working size, twice; log scale; radians) below which resampling and
 rounding to 8 bits dominate, added in quadrature."""
+
+NOISE_SLOPE = (1 - np.exp(-1)) / 8
+"""Variance per px of the mean slope of two pictures' white noise, of that of their difference: of
+white noise blurred by 1 px, neighbours two px apart correlate by exp(-1)."""
+
+ROUNDING = 2 / 12 / 255**2 / (4 * np.pi)
+"""Variance of the difference of two pictures in 8 bits, blurred by 1 px."""
+
+OVER_NOISE, ISOTROPY = 4.0, 0.02
+"""Least information on a motion that the texture must hold: in that of the slopes of the pictures'
+own noise, and in that on the best known motion. Stripes in every direction reach 3 and, where their
+jagged edges exceed the noise, 0.01; the drifts of ``benchmarks/drift.py`` 6 and 0.15."""
 
 WIDENING = 2.0
 """Factor on the half widths of the sandwich estimate, which neglects that residuals correlate
@@ -78,22 +92,43 @@ class Drift:
         )
 
 
+@dataclass(frozen=True)
+class NoDrift:
+    """Absence of a similarity between a picture and its edit.
+
+    Attributes:
+        why: the reason; empty if the picture is stretched or sheared.
+        stretch: percent by which the edit shows everything longer in one direction than across it,
+            0 if unknown; a shear by 5 % is a stretch by 5 %.
+        largest: displacement of the corner that a stretch moves most, px; -1 if unknown.
+    """
+
+    why: str
+    stretch: float = 0.0
+    largest: float = -1.0
+
+    @property
+    def seen(self) -> bool:
+        """True if the picture is stretched or sheared."""
+        return not self.why
+
+    def __str__(self) -> str:
+        return self.why or (
+            f"but by no shift, scale and turn: it is stretched or sheared by {self.stretch:.1f} %,"
+            f" corners by {self.largest:.1f} px"
+        )
+
+
+UNTEXTURED = NoDrift("too little of what it should leave alone is textured")
+STRIPED = NoDrift("its texture runs in one direction, and a shift along it leaves no trace")
+UNRELATED = NoDrift("what it should leave alone shares no motion with the picture")
+SMALL = NoDrift(f"the picture is smaller than {SHORTEST} px")
+
+
 def drift(
     before: npt.NDArray[Any], after: npt.NDArray[Any], left: npt.NDArray[np.bool_] | None = None
 ) -> Drift | None:
-    """Measure the drift between a picture and its edit.
-
-    Args:
-        before: (h, w, 3) the picture, uint8 or floating in [0, 1].
-        after: (h, w, 3) its edit.
-        left: (h, w) True where the edit should leave the picture as it is; None for everywhere.
-
-    Returns:
-        The drift; None if too little is textured or left alone to tell, or both sides are below
-        :data:`SHORTEST`.
-
-    Raises:
-        ValueError: the pictures or the mask have other shapes.
+    """Measure the drift between a picture and its edit; None if :func:`drift_or_why` finds none.
 
     Example:
         >>> import cv2
@@ -104,8 +139,33 @@ def drift(
         (3.0, 0.0, 0.0)
         >>> drift(before, np.zeros_like(before)) is None
         True
-        >>> drift(before[:32, :32], before[:32, :32]) is None
-        True
+    """
+    found = drift_or_why(before, after, left)
+    return found if isinstance(found, Drift) else None
+
+
+def drift_or_why(
+    before: npt.NDArray[Any], after: npt.NDArray[Any], left: npt.NDArray[np.bool_] | None = None
+) -> Drift | NoDrift:
+    """Measure the drift between a picture and its edit, or find why there is none to tell.
+
+    Args:
+        before: (h, w, 3) the picture, uint8 or floating in [0, 1].
+        after: (h, w, 3) its edit.
+        left: (h, w) True where the edit should leave the picture as it is; None for everywhere.
+
+    Returns:
+        The drift; else a stretch, or the reason why neither can be told.
+
+    Raises:
+        ValueError: the pictures or the mask have other shapes.
+
+    Example:
+        >>> flat = np.full((128, 128, 3), 0.5)
+        >>> drift_or_why(flat, flat).why
+        'too little of what it should leave alone is textured'
+        >>> drift_or_why(flat[:32, :32], flat[:32, :32]).why
+        'the picture is smaller than 40 px'
     """
     size = before.shape[:2]
     mask = np.ones(size, bool) if left is None else np.asarray(left, bool)
@@ -115,21 +175,43 @@ def drift(
         )
     longest = max(size)
     if longest < SHORTEST:
-        return None
+        return SMALL
     pictures = _gray(before), _gray(after)
     sides = [side for side in (64, 128, 256) if side < longest] + [min(longest, LONGEST)]
     levels = [_Level.of(pictures[0], pictures[1], mask, side) for side in sides]
     draw = np.random.default_rng(0)
-    found = _aligned(levels[:2], np.zeros(4), draw)
+    if levels[-1].textured < 10:
+        return UNTEXTURED
+    coarse, fine, starts = levels[:2], levels[2:], [np.zeros(4)]
+
+    def refined(fit: _Fit | None) -> _Fit | None:
+        return _aligned(fine, fit.motion, draw) if fit is not None and fine else fit
+
+    found = _aligned(coarse, starts[0], draw)
     if found is None or found.agreeing < 2 * AGREEING:
-        tried = [_aligned(levels[:2], start, draw) for start in _search(levels[0])]
-        found = max((f for f in [found, *tried] if f), key=lambda f: f.agreeing, default=None)
-    if found is not None and levels[2:]:
-        found = _aligned(levels[2:], found.motion, draw)
-    if found is None or found.agreeing < AGREEING:
-        return None
-    half = found.half_widths()
-    return None if half is None else _drift(found.motion, half, longest, size)
+        starts += _search(coarse[0])
+        found = _best([found, *(_aligned(coarse, start, draw) for start in starts[1:])])
+    found = refined(found)
+    if similar := found is not None and found.agreeing >= AGREEING:
+        affine = _aligned(levels[-1:], np.r_[found.motion, 0, 0], draw)
+    else:
+        tried = (_aligned(coarse, np.r_[start, 0, 0], draw) for start in starts)
+        found = affine = refined(_best(tried))
+        if affine is None or affine.agreeing < AGREEING:
+            return UNRELATED
+    if not found.resolved:
+        return STRIPED
+    if affine is not None and (stretch := affine.stretch()) is not None:
+        away = float(np.sinh(stretch) * np.hypot(*size) / 2)
+        if away >= 0.5 or not similar:  # half of what the edges move by, so that 1 px is seen
+            return NoDrift("", 100 * float(np.expm1(2 * stretch)), away)
+    half = found.half_widths() if similar else None
+    return UNTEXTURED if half is None else _drift(found.motion, half, longest, size)
+
+
+def _best(fits: Iterable[_Fit | None]) -> _Fit | None:
+    """Return the fit on which most tiles agree; None for none."""
+    return max((fit for fit in fits if fit), key=lambda fit: fit.agreeing, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +234,16 @@ class _Level:
         one, two = (cv2.GaussianBlur(p, (0, 0), 1.0) for p in (one, two))
         return cls(one, two, mask > 0.95, np.array([w - 1, h - 1]) / 2, side)
 
+    @property
+    def tile(self) -> int:
+        """Side of a tile in px."""
+        return max(8, self.side // 16)
+
+    @property
+    def textured(self) -> int:
+        """Number of textured tiles of the picture."""
+        return int(_tiles(self.before, self.before, self.left, self.tile)[3].sum())
+
     def affine(self, motion: Floats) -> Floats:
         """Return the (2, 3) map from px of the picture to px of the edit."""
         turned = _linear(motion)
@@ -172,15 +264,29 @@ class _Level:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Similarity that most tiles share."""
+    """Similarity, or affine map, that most tiles share."""
 
     motion: Floats
     agreeing: float
     used: npt.NDArray[np.bool_]
     scores: Floats
-    """(tiles, 4) weighted gradients of the fit."""
+    """(tiles, 4 or 6) weighted gradients of the fit."""
     normal: Floats
     cells: npt.NDArray[np.intp]
+    information: Floats
+    """(4 or 6,) information on its motions in that of the pictures' own noise, ascending."""
+
+    @property
+    def resolved(self) -> bool:
+        """True if the texture shows every motion."""
+        least, most = self.information[[0, -1]]
+        return bool(least >= OVER_NOISE and least >= ISOTROPY * most)
+
+    def stretch(self) -> float | None:
+        """Return half the log ratio of an affine map's axes; None within its half widths."""
+        half = self.half_widths()
+        told = half is not None and (np.abs(self.motion[4:]) > half[4:]).any()
+        return float(np.hypot(*self.motion[4:])) if told else None
 
     def half_widths(self) -> Floats | None:
         """Return 99 % half widths from the scatter between cells; None for too few cells.
@@ -189,11 +295,11 @@ class _Fit:
         cells of a sixth of the picture.
         """
         cells = np.unique(self.cells[self.used])
-        if len(cells) < 6 or self.used.sum() < 10:
+        if len(cells) < len(self.motion) + 2 or self.used.sum() < 10:
             return None
         sums = np.stack([self.scores[self.used & (self.cells == cell)].sum(0) for cell in cells])
         inverse = np.linalg.inv(self.normal)
-        free = len(cells) - 4
+        free = len(cells) - len(self.motion)
         covariance = inverse @ (sums.T @ sums) @ inverse * len(cells) / free
         return np.asarray(WIDENING * stdtrit(free, 0.995) * np.sqrt(np.diag(covariance)))
 
@@ -214,8 +320,12 @@ def _drift(motion: Floats, half: Floats, longest: int, size: tuple[int, ...]) ->
 
 
 def _linear(motion: Floats) -> Floats:
-    cos, sin = np.cos(motion[3]), np.sin(motion[3])
-    return np.asarray(np.exp(motion[2]) * np.array([[cos, -sin], [sin, cos]]))
+    """Return the (2, 2) matrix of shift, log scale and turn, and of a stretch along and across the
+    axes and their diagonals, if given."""
+    scale, turn, along, across = np.r_[motion[2:], 0, 0][:4]
+    return np.asarray(
+        expm(np.array([[scale + along, across - turn], [across + turn, scale - along]]))
+    )
 
 
 def _gray(picture: npt.NDArray[Any]) -> Floats:
@@ -241,15 +351,16 @@ def _aligned(levels: Sequence[_Level], motion: Floats, draw: np.random.Generator
 
 def _step(level: _Level, motion: Floats, radius: float, draw: np.random.Generator) -> _Fit | None:
     back, shown = level.moved_back(motion)
-    tile = max(8, level.side // 16)
-    shift, variance, textured, good, at, cells = _tiles(
-        level.before, back, level.left & shown, tile
+    shift, variance, over_noise, textured, good, at, cells = _tiles(
+        level.before, back, level.left & shown, level.tile
     )
     if good.sum() < 4:
         return None
     x, y = ((at - level.middle) / level.side).T
     one, zero = np.ones_like(x), np.zeros_like(x)
-    design = np.stack([np.stack([one, zero, x, -y], -1), np.stack([zero, one, y, x], -1)], 1)
+    design = np.stack(
+        [np.stack([one, zero, x, -y, x, y], -1), np.stack([zero, one, y, x, -y, x], -1)], 1
+    )[..., : len(motion)]
     shift, radius = shift / level.side, radius / level.side
     change = _consensus(design[good], shift[good], radius, draw)
     inverse = np.linalg.inv(variance / level.side**2 + 0.01 * radius**2 * np.eye(2))
@@ -262,21 +373,39 @@ def _step(level: _Level, motion: Floats, radius: float, draw: np.random.Generato
         normal = np.einsum("til,tlj->ij", weighted, design)
         change = np.linalg.solve(normal, np.einsum("til,tl->i", weighted, shift))
     scores = np.einsum("til,tl->ti", weighted, shift - design @ change)
+    known = np.einsum("tki,tkl,tlj,t->ij", design, over_noise, design, weight)
+    of_noise = np.einsum("tki,tkj,t->ij", design, design, weight)
+    scale, turn, along, across = np.r_[change[2:], 0, 0][:4]
     linear = _linear(motion)
-    total = np.r_[motion[:2] + linear @ change[:2], motion[2:]]
-    grown = linear @ np.array([[1 + change[2], -change[3]], [change[3], 1 + change[2]]])
-    total[2:] = np.log(np.hypot(*grown[:, 0])), np.arctan2(grown[1, 0], grown[0, 0])
-    return _Fit(
-        total, float(weight.sum() / max(textured.sum(), 1)), weight > 0, scores, normal, cells
+    grown = linear @ (
+        np.eye(2) + np.array([[scale + along, across - turn], [across + turn, scale - along]])
     )
+    log = np.real(logm(grown))
+    halves = (
+        np.array(
+            [
+                log[0, 0] + log[1, 1],
+                log[1, 0] - log[0, 1],
+                log[0, 0] - log[1, 1],
+                log[0, 1] + log[1, 0],
+            ]
+        )
+        / 2
+    )
+    total = np.r_[motion[:2] + linear @ change[:2], halves][: len(motion)]
+    return _Fit(
+        total, float(weight.sum() / max(textured.sum(), 1)), weight > 0, scores, normal, cells,
+        eigh(known, of_noise, eigvals_only=True),
+    )  # fmt: skip
 
 
 def _consensus(design: Floats, shift: Floats, radius: float, draw: np.random.Generator) -> Floats:
-    """Return the similarity of two tiles that most tiles share (RANSAC with truncated squares)."""
-    pairs = draw.integers(0, len(shift), (300, 2))
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    systems = design[pairs].reshape(-1, 4, 4)
-    solved = np.einsum("nij,nj->ni", np.linalg.pinv(systems), shift[pairs].reshape(-1, 4))
+    """Return the map of two or three tiles that most tiles share (RANSAC, truncated squares)."""
+    count = design.shape[2]
+    picks = draw.integers(0, len(shift), (300, count // 2))
+    picks = picks[(np.diff(np.sort(picks)) > 0).all(1)]
+    systems = design[picks].reshape(-1, count, count)
+    solved = np.einsum("nij,nj->ni", np.linalg.pinv(systems), shift[picks].reshape(-1, count))
     residual = shift[None] - np.einsum("tki,ni->ntk", design, solved)
     loss = np.minimum((residual**2).sum(-1) / radius**2, 1).sum(1)
     return np.asarray(solved[np.argmin(loss)])
@@ -289,8 +418,9 @@ def _tiles(before: Floats, back: Floats, valid: npt.NDArray[np.bool_], tile: int
     (Malis 2004, efficient second-order minimisation).
 
     Returns:
-        (tiles, 2) shifts in px, (tiles, 2, 2) their variances, (tiles,) textured, (tiles,) aligned,
-        (tiles, 2) middles, (tiles,) numbers of cells.
+        (tiles, 2) shifts in px, (tiles, 2, 2) their variances, (tiles, 2, 2) their information in
+        that of the pictures' own noise, (tiles,) textured, (tiles,) aligned, (tiles, 2) middles,
+        (tiles,) numbers of cells.
     """
     h, w = before.shape
     rows, columns = h // tile, w // tile
@@ -329,7 +459,10 @@ def _tiles(before: Floats, back: Floats, valid: npt.NDArray[np.bool_], tile: int
     step = np.einsum("tij,tpj,tp->ti", inverse, jacobian, error, optimize=True)
     rest = error - np.einsum("tpi,ti->tp", jacobian, step)
     # The blur of 1 px makes about four neighbouring residuals one.
-    noise = 4 * (rest**2).sum(1) / np.maximum(count - 5, 1)
+    spread = (rest**2).sum(1) / np.maximum(count - 5, 1)
+    noise = 4 * spread
+    of_noise = NOISE_SLOPE * np.maximum(spread, ROUNDING) * np.maximum(count, 1)
+    over_noise = np.linalg.inv(inverse[:, :2, :2]) / of_noise[:, None, None]
     textured = (count >= 0.6 * tile**2) & (squares > 2e-5 * count)
     good = textured & (others > 2e-5 * count) & (np.linalg.norm(step[:, :2], axis=1) < 6)
     good &= np.abs(product) > 0.3 * np.sqrt(squares * others)
@@ -337,7 +470,15 @@ def _tiles(before: Floats, back: Floats, valid: npt.NDArray[np.bool_], tile: int
     row, column = np.divmod(np.arange(rows * columns), columns)
     at = np.stack([column, row], -1) * tile + (tile - 1) / 2 + [start, top]
     cells = (row * 6 // rows) * 6 + column * 6 // columns
-    return step[:, :2], inverse[:, :2, :2] * noise[:, None, None], textured, good, at, cells
+    return (
+        step[:, :2],
+        inverse[:, :2, :2] * noise[:, None, None],
+        over_noise,
+        textured,
+        good,
+        at,
+        cells,
+    )
 
 
 def _search(level: _Level, best: int = 4) -> list[Floats]:

@@ -41,14 +41,22 @@ class Formula:
         self.phases = 2 * np.pi * draw.random(20)
         self.sizes = draw.normal(size=(20, 3)) * np.sqrt(length)[:, None] / 8
 
-    def picture(self, size: int, motion: Sequence[float] = (0, 0, 0, 0)) -> np.ndarray:
-        """(size, size, 3) in [0, 1] at the pixels' centres."""
+    def picture(
+        self, size: int, motion: Sequence[float] = (0, 0, 0, 0), stretch: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(size, size, 3) in [0, 1] at the pixels' centres.
+
+        Args:
+            stretch: (2, 2) map about the middle, before the motion.
+        """
         right, down, percent, degrees = motion
         at = np.arange(size) + 0.5 - size / 2
         x, y = np.meshgrid(at - right, at - down)
         turn, scale = np.radians(degrees), 1 + percent / 100
         back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) / scale
         points = np.stack([x.ravel(), y.ravel()], -1) @ back.T
+        if stretch is not None:
+            points = points @ np.linalg.inv(stretch).T
         values = np.tanh(np.sin(points @ self.waves + self.phases) @ self.sizes) / 2 + 0.5
         return values.reshape(size, size, 3)
 

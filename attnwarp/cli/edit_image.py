@@ -122,7 +122,7 @@ def edit_image(
 
     from attnwarp import check
     from attnwarp.devices import choose
-    from attnwarp.drift import drift
+    from attnwarp.drift import drift_or_why
     from attnwarp.editing.editor import edit
     from attnwarp.editing.memory import announced
     from attnwarp.editing.segment import load_segmenter
@@ -184,9 +184,10 @@ def edit_image(
     if sheet is not None:
         _write(sheet, _sheet(tiles))
     typer.echo(out)
-    moved = drift(image, np.clip(edited, 0, 1), None if share is None else share[..., 0] == 0)
-    if moved is not None and moved.seen:
-        warnings.warn(f"the edit moved the picture: {moved}", InputWarning, stacklevel=1)
+    left = None if share is None else share[..., 0] == 0
+    moved = drift_or_why(image, np.clip(edited, 0, 1), left)
+    if moved.seen:
+        warnings.warn(f"the edit moved the picture, {moved}", InputWarning, stacklevel=1)
 
 
 def _read(path: Path) -> Image:

@@ -158,10 +158,11 @@ class Result:
         seconds: time by part, summed over all processes of the run.
         cut: budget limit that ended the run, "seconds" or "network_rows"; None for a complete
             run.
-        change: dE00 inside the mask: of the "scene", from renders before to renders after, and of
+        change: dE00 inside the mask: of the "scene", net of what tuning alone changes, and of
             the "source view", or of the "edited views" by a method without a source.
         drift: "view" and "drift": how the edit of the source, or of the view that moved most,
-            shifts, scales and turns the picture, see :class:`attnwarp.drift.Drift`.
+            shifts, scales and turns the picture, see :class:`attnwarp.drift.Drift`, or why this
+            can't be told, see :class:`attnwarp.drift.NoDrift`.
 
     Example:
         >>> import numpy as np

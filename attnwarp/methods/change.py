@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from attnwarp.colors import ciede2000, to_lab
-from attnwarp.drift import Drift, drift
+from attnwarp.drift import Drift, NoDrift, drift_or_why
 from attnwarp.methods.pictures import Bytes, Image, Mask, Size, resized, to_bytes
 from attnwarp.methods.work import Work
 
@@ -68,36 +68,39 @@ def change_of(
     }
 
 
-def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
+def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any]:
     """Measure how far an editor moved what lies outside the mask.
 
     Args:
         picture: (h, w, 3) its edit, before it is composed with the original outside the mask.
 
     Returns:
-        Attributes of a :class:`attnwarp.drift.Drift`; None if it can't be told.
+        Attributes of a :class:`attnwarp.drift.Drift` or :class:`attnwarp.drift.NoDrift`.
     """
     size, segments = picture.shape[:2], work.segments
     left = None
     if segments is not None:
         touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
         left = resized(touched, size)[..., 0] == 0
-    found = drift(to_bytes(resized(work.views.picture(view), size)), to_bytes(picture), left)
-    return None if found is None else asdict(found)
+    before = to_bytes(resized(work.views.picture(view), size))
+    return asdict(drift_or_why(before, to_bytes(picture), left))
 
 
 def say_drift(edit: Mapping[str, Any]) -> tuple[str, bool]:
     """Write a line about the drift of an edit, and whether it warns."""
     if not edit["view"]:
         return "no view was edited", False
-    if edit["drift"] is None:
-        return f"whether the edit of {edit['view']} moved the picture can't be told", False
-    moved = Drift(**edit["drift"])
-    if not moved.seen:
-        return f"the edit of {edit['view']} left the picture in place ({moved})", False
+    told = edit["drift"]
+    if told is None or told.get("why"):  # runs before the reason was kept have none
+        why = f": {told['why']}" if told else ""
+        return f"whether the edit of {edit['view']} moved the picture can't be told{why}", False
+    found = Drift(**told) if "right" in told else NoDrift(**told)
+    if isinstance(found, Drift) and not found.seen:
+        return f"the edit of {edit['view']} left the picture in place ({found})", False
+    how = f"corners by {found.largest:.1f} px ({found})" if isinstance(found, Drift) else found
     return (
-        f"the edit of {edit['view']} moved the picture, corners by {moved.largest:.1f} px"
-        f" ({moved}); warps assume that it stays: try another seed or editor"
+        f"the edit of {edit['view']} moved the picture, {how}; warps assume that it stays: try"
+        " another seed or editor"
     ), True
 
 

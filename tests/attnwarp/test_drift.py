@@ -11,7 +11,7 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.camera import Camera
-from attnwarp.drift import drift
+from attnwarp.drift import STRIPED, NoDrift, drift, drift_or_why
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.change import say_drift
@@ -66,6 +66,57 @@ def test_a_picture_rendered_from_a_moved_camera_has_the_cameras_drift() -> None:
     assert got is not None
     errors = np.abs([got.right - 3.25, got.down + 1.5, got.scale - 2, got.turn])
     assert (errors <= np.minimum(ASKED, got.half_widths)).all()
+
+
+def drawn_stripes(kind: str, angle: float, seed: int, size: int = 128) -> np.ndarray:
+    """(size, size, 3) stripes in [0, 1], the same along the direction across ``angle``."""
+    draw, at = np.random.default_rng(seed), np.arange(size) + 0.5
+    x, y = np.meshgrid(at, at)
+    across, width = np.cos(angle) * x + np.sin(angle) * y, draw.uniform(12, 30)
+    values = {
+        "blinds": 0.5 + 0.4 * np.tanh(4 * np.sin(2 * np.pi * across / width)),
+        "planks": 0.2 + 0.6 * draw.random(40)[(across // width).astype(int) % 40],
+        "curtain": 0.5 + 0.12 * sum(np.sin(across / c + c) for c in draw.uniform(2, 12, 6)),
+    }[kind]
+    return values[..., None] * draw.uniform(0.6, 1, 3)
+
+
+@pytest.mark.parametrize(("kind", "angle", "noise"), [
+    ("blinds", 0, 0.005), ("planks", np.pi / 2, 0.02), ("curtain", 0.5, 0.01),
+])  # fmt: skip
+def test_a_shift_along_stripes_is_not_told(kind: str, angle: float, noise: float) -> None:
+    draw, before = np.random.default_rng(0), drawn_stripes(kind, angle, 0)
+    pictures = (before, before * draw.uniform(0.6, 1, 3))  # recoloured, not moved
+    noisy = [p + noise * draw.normal(size=p.shape) for p in pictures]
+    found = drift_or_why(*(np.rint(255 * p.clip(0, 1)).astype(np.uint8) for p in noisy))
+    assert found == STRIPED
+
+
+@pytest.mark.parametrize(("matrix", "percent"), [
+    ([[1.04, 0], [0, 1]], 4), ([[1, 0], [0.03, 1.03]], None), ([[1, 0.1], [0, 1]], None),
+])  # fmt: skip
+def test_a_stretched_or_sheared_picture_moved_by_no_similarity(
+    matrix: list[list[float]], percent: float | None
+) -> None:
+    formula, map_ = Formula(6), np.array(matrix)
+    found = drift_or_why(formula.picture(192), 0.7 * formula.picture(192, stretch=map_))
+    axes = np.linalg.svd(map_, compute_uv=False)
+    assert isinstance(found, NoDrift) and found.seen
+    assert found.stretch == pytest.approx(100 * (axes[0] / axes[1] - 1), abs=0.1)
+    assert percent is None or found.stretch == pytest.approx(percent, abs=0.1)
+    line, warns = say_drift({"view": "front", "drift": vars(found)})
+    assert warns and "moved the picture, but by no shift, scale and turn" in line
+
+
+def test_the_page_says_why_a_drift_is_not_told() -> None:
+    stripes, flat = drawn_stripes("blinds", 0, 0), np.full((128, 128, 3), 0.5)
+    other, formula = Formula(1).picture(128), Formula(2).picture(128)
+    for before, after, why in (
+        (stripes, stripes, "runs in one direction"), (flat, flat, "too little"),
+        (other, formula, "shares no motion"), (other[:32, :32], other[:32, :32], "smaller than"),
+    ):  # fmt: skip
+        line, warns = say_drift({"view": "front", "drift": vars(drift_or_why(before, after))})
+        assert not warns and "can't be told: " in line and why in line
 
 
 @pytest.mark.parametrize("other", ["another picture", "noise", "flat", "nothing left"])

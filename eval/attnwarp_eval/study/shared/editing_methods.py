@@ -214,7 +214,7 @@ def _edited(result: Any) -> EditedScene:
     found = result.drift.get("drift")
     return EditedScene(
         result.gaussians, result.edited, result.seconds, result.counters, result.cut, result.rounds,
-        math.nan if found is None else found["largest"],
+        found["largest"] if found and "right" in found else math.nan,
     )  # fmt: skip
 
 
