@@ -40,9 +40,8 @@ from attnwarp.methods.change import MOST_DRIFTS, Change, change_of, drift_of, sa
 from attnwarp.methods.pictures import (
     Bytes,
     Image,
-    enlarged,
     full_size,
-    resized,
+    labelled,
     to_bytes,
 )
 from attnwarp.methods.scene import (
@@ -656,28 +655,20 @@ class _Run:
                 self.folder.write_picture(path, to_bytes(share))
 
     def _sheet(self) -> Bytes:
-        """Draw rows: renders before, edits (black if missing), renders after. Columns: views."""
-        count = len(self.names)
-        views = (
-            [k * count // SHEET_VIEWS for k in range(SHEET_VIEWS)]
-            if count > SHEET_VIEWS
-            else [*range(count)]
-        )
-        h, w = self.work.views.images[views[0]].shape[:2]
-
-        def tile(name: str) -> Bytes:
-            if not self.folder.has(name):
-                return np.zeros((h, w, 3), np.uint8)
-            pixels = self.folder.read_picture(name)
-            if pixels.shape[0] < h:
-                return enlarged(pixels, (h, w))
-            return to_bytes(resized(pixels.astype(np.float32) / np.float32(255), (h, w)))
-
-        rows = [
-            np.concatenate([tile(f"{part}/{self.names[view]}.png") for view in views], axis=1)
-            for part in ("renders/before", "views", "renders/after")
-        ]
-        return np.concatenate(rows)
+        """Draw rows: renders before, edits, renders after. Columns: the source and edited views."""
+        source = self.method.about.get("source")
+        edited = [name for name in self.names if self.folder.has(f"views/{name}.png")]
+        others = [name for name in edited or self.names if name != source]
+        first = [source] if source in edited else []
+        room = min(SHEET_VIEWS - len(first), len(others))
+        shown = [*first, *(others[k * len(others) // room] for k in range(room))]
+        parts = {"before": "renders/before", "edit": "views", "after": "renders/after"}
+        rows = {
+            title: [self.folder.read_picture(f"{part}/{name}.png") for name in shown]
+            for title, part in parts.items()
+            if edited or part != "views"
+        }
+        return labelled(rows, [f"{name} (source)" if name in first else name for name in shown])
 
     # --- progress
 

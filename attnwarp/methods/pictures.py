@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -203,6 +204,40 @@ class FeaturePictures:
         numbers = sorted(plan.recorded)
         timestep = recording.timesteps[numbers[len(numbers) // 2]]
         return layer, recording.features(timestep, layer, plan.keep[0])[0].float()
+
+
+TILE = 160, 480
+"""Least and largest height in px of a sheet's pictures, so that labels have room."""
+
+
+def labelled(rows: Mapping[str, Sequence[Bytes]], columns: Sequence[str]) -> Bytes:
+    """Arrange pictures in a grid with the names of its rows and columns, (H, W, 3) uint8.
+
+    Args:
+        rows: (h, w, 3) uint8 pictures by the row's name, one for each column.
+    """
+    from PIL import Image as Drawing
+    from PIL import ImageDraw, ImageFont
+
+    h, w = next(iter(rows.values()))[0].shape[:2]
+    least, most = TILE
+    scale = -(-least // h) if h < least else min(1.0, most / h)
+    h, w, line, side = round(scale * h), round(scale * w), 24, 64
+    size = (side + len(columns) * w, line + len(rows) * h)
+    sheet, font = Drawing.new("RGB", size, "white"), ImageFont.load_default(14)
+    draw = ImageDraw.Draw(sheet)
+    for k, name in enumerate(columns):
+        while name and font.getlength(name) > w - 4:
+            name = name[1:]  # the ends of views' names differ
+        draw.text((side + k * w + 2, 4), name, "black", font)
+    for number, (title, pictures) in enumerate(rows.items()):
+        draw.text((4, line + number * h + 4), title, "black", font)
+        for k, pixels in enumerate(pictures):
+            tile = enlarged(pixels, (h, w)) if pixels.shape[0] < h else to_bytes(
+                resized(pixels.astype(np.float32) / np.float32(255), (h, w))
+            )  # fmt: skip
+            sheet.paste(Drawing.fromarray(tile), (side + k * w, line + number * h))
+    return np.asarray(sheet)
 
 
 def enlarged(pixels: Bytes, size: Size) -> Bytes:
