@@ -7,6 +7,7 @@ import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
+from attnwarp.errors import InputError
 from attnwarp.reporting import Reporter
 
 FOLDER = Path(__file__).parent / "scenes"
@@ -46,19 +47,27 @@ def capture(name: str, folder: Path, report: Reporter) -> str:
     return f"{name} is a bundled scene, rendered and fitted by {made}"
 
 
-def exact_masks(folder: Path, instruction: str, report: Reporter) -> Path | None:
+def exact_masks(
+    folder: Path, instruction: str, report: Reporter, *, anyway: bool = False
+) -> Path | None:
     """Find exact masks of the object named by an instruction, in a folder of :func:`capture`.
 
+    Args:
+        anyway: True edits the whole picture if the instruction names no object.
+
     Returns:
-        Folder of masks; None, with a report line, if the instruction names no object.
+        Folder of masks; None for the whole picture.
     """
     objects = sorted(path.name for path in (folder / "masks").iterdir())
     words = f" {' '.join(re.findall(r'[a-z0-9]+', instruction.lower()))} "
-    named = [name for name in objects if f" {name.replace('_', ' ')} " in words]
-    if not named:
-        report.log(
-            f"the whole picture is edited: {instruction!r} names none of {', '.join(objects)}"
+    named = [name for name in objects if re.search(f" {name.replace('_', ' ')}(e?s)? ", words)]
+    if not named and not anyway:
+        raise InputError(
+            f"instruction: {instruction!r} names none of the scene's {', '.join(objects)}; name"
+            " one, mark what is edited, such as by --at X,Y, or edit the whole picture by --anyway"
         )
+    if not named:
+        report.log("the whole picture is edited, as the instruction names nothing in it")
         return None
     report.log(f"nothing but the {named[0]} is edited, inside its exact mask: {folder / 'masks'}")
     return folder / "masks" / named[0]

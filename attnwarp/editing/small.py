@@ -9,6 +9,7 @@ import json
 import re
 import unicodedata
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,6 +113,28 @@ of day, one or any. Other words name objects or join.
 """
 
 
+JOINING = {
+    *("a", "an", "the", "it", "its", "this", "that", "these", "those", "all", "some", "my", "our"),
+    *("and", "or", "of", "to", "into", "in", "on", "at", "by", "for", "from", "with", "as", "like"),
+    *("is", "are", "be", "has", "have", "so", "please", "make", "turn", "give", "more", "very"),
+}
+"""Words that join an instruction's others, so they are never named as unknown."""
+
+ENDINGS = ("", "s", "es", "d", "ed", "y", "n", "en", "e", "ing")
+"""Endings by which forms of one word differ."""
+
+
+def forms(word: str) -> set[str]:
+    """List forms that a word may have: "stripes" is a form of "striped".
+
+    Example:
+        >>> {"striped", "stripe"} <= forms("stripes"), "wood" in forms("wooden")
+        (True, True)
+    """
+    stems = {word.removesuffix(ending) for ending in ENDINGS}
+    return {stem + ending for stem in stems if len(stem) > 2 for ending in ENDINGS}
+
+
 def check_words(name: str, text: str, *, anyway: bool = False) -> None:
     """Refuse, before loading, an instruction that an editor would ignore; warn of words that a
     bundled editor was not trained on.
@@ -126,15 +149,18 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
         return
     card = f"{WEIGHTS / name / 'card.md'} says what it can do"
     words = {word.lower() for word in _words(text)}
+    unknown = [word for word in unknown_words(name, text) if word.lower() not in JOINING]
+    known = {word: sorted(forms(word.lower()) & _tokens(name) & LOOKS) for word in unknown}
+    named = [f"{w!r}" + f" (it knows {', '.join(known[w])})" * bool(known[w]) for w in unknown]
     if not (anyway or words & LOOKS or guide_of(name) == "depth"):
+        say = "".join(f"; it knows {', '.join(k)} for {w!r}" for w, k in known.items() if k)
         raise InputError(
             f"instruction: {text!r} names no color, material, pattern, ground or time of day that"
-            f" the editor {name!r} knows, so it would do nothing of it; {card}, --anyway tries"
+            f" the editor {name!r} knows, so it would do nothing of it{say}; {card}, --anyway tries"
         )
-    unknown = unknown_words(name, text)
     if unknown:
         warnings.warn(
-            f"instruction: the editor {name!r} was not trained on {', '.join(map(repr, unknown))},"
+            f"instruction: the editor {name!r} was not trained on {', '.join(named)},"
             f" so the result may have nothing to do with it; {card}",
             InputWarning,
             stacklevel=2,
@@ -144,9 +170,15 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
 def unknown_words(name: str, text: str) -> list[str]:
     """Words that a bundled editor was not trained on: its tokenizer has a token for each training
     word and splits other words."""
+    return [word for word in _words(text) if word.lower() not in _tokens(name)]
+
+
+@cache
+def _tokens(name: str) -> set[str]:
+    """List the tokens of a bundled editor that begin a word."""
     file = WEIGHTS / name / "tokenizer" / "tokenizer.json"
     tokens = json.loads(file.read_text(encoding="utf-8"))["model"]["vocab"]
-    return [word for word in _words(text) if f"Ġ{word.lower()}" not in tokens]
+    return {token[1:] for token in tokens if token[0] == "Ġ"}
 
 
 def _words(text: str) -> list[str]:

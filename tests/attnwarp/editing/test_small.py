@@ -1,5 +1,7 @@
 """The bundled editors as they ship: sizes, cards, and diffusers' own pipeline on the same folder."""
 
+import json
+import re
 import shutil
 import unicodedata
 import warnings
@@ -16,6 +18,7 @@ from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.small import (
     DEPTH_GUIDANCE,
     IMAGE_GUIDANCE,
+    LOOKS,
     TEXT_GUIDANCE,
     WEIGHTS,
     bundled,
@@ -90,11 +93,29 @@ def test_words_that_no_training_text_has_are_named_and_no_others():
     """Oracle: the words that the card and the shipped scenes' edits use, and invented ones."""
     with pytest.warns(InputWarning, match="not trained on 'zorgoblatt', 'Sphinx', so"):
         check_words("small-plain", "make the red bear zorgoblatt and turn it into the Sphinx")
+    with pytest.warns(InputWarning, match=r"trained on 'stripes' \(it knows striped\), so"):
+        check_words("small-plain", "make all of it red with stripes, please")
+    with pytest.raises(InputError, match="it knows striped for 'Stripes'; "):
+        check_words("small-plain", "Stripes")
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputWarning)
         for text in ("Make the ground snow!", "turn the man into bronze, at night", "striped"):
             check_words("small-plain", text)
         check_words("a/folder", "zorgoblatt")
+
+
+@pytest.mark.parametrize("name", ["small-plain", "small-depth"])
+def test_the_card_lists_the_words_for_a_look_exactly(name):
+    """Oracle: the tokenizer's file, whose tokens hold each training word whole."""
+    card = (WEIGHTS / name / "card.md").read_text()
+    tokens = json.loads((WEIGHTS / name / "tokenizer/tokenizer.json").read_text())["model"]["vocab"]
+    looks, things = (
+        re.search(rf"\*\*Words for {what}\*\*: (.*)\.\n", card)[1].split(", ")
+        for what in ("a look", "things")
+    )
+    assert set(looks) == {word for word in LOOKS if f"Ġ{word}" in tokens}
+    assert len(things) > 50 and not set(looks) & set(things)
+    assert all(f"Ġ{word}" in tokens for word in things)
 
 
 def test_words_are_unknown_where_the_tokenizer_takes_them_apart():
