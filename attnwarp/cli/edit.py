@@ -37,13 +37,10 @@ from attnwarp.cli.options import (
     option,
     options_of,
 )
-from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
+from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads, warned
 from attnwarp.editing.small import check_words, guide_of, own_steps_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
-
-NO_FEATURES = 0.001
-"""Share of warped target pixels below which each view was effectively edited alone."""
 
 DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_size")
 """Fields of `Editing` that decide the result of an edit."""
@@ -154,6 +151,12 @@ def edit(
         if alone:
             changes["a0"], flags["a0"] = 0.0, "--each-view-alone"
         scene = str(data) if str(data) in bundled() and not data.exists() else None
+        if str(data) in bundled() and not scene:
+            warnings.warn(
+                f"{data}: {data.resolve()} is edited, not the bundled scene of that name",
+                InputWarning,
+                stacklevel=1,
+            )
         if scene:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], flags)
@@ -171,7 +174,7 @@ def edit(
         from attnwarp import check, methods
         from attnwarp.fit import read_exposures
         from attnwarp.io.file import existing_file
-        from attnwarp.methods.change import say_change, say_drift, say_little
+        from attnwarp.methods.change import say_change
         from attnwarp.methods.command import (
             FitPlan,
             check_asked,
@@ -210,11 +213,11 @@ def edit(
             origin = capture(scene, data, report)
             if (ply, fit_iterations, max_splats, kind) == (None,) * 4:
                 ply = data / "splats.ply"
-            if editing.masks is None and not edit_options.marks.of_source:
-                marks = Marks(exact_masks(data, instruction, report))
-                edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
         check_marked(edit_options, dataset)
+        if scene and not edit_options.marks.option:
+            masks = exact_masks(data, instruction, report, anyway=anyway)
+            edit_options = replace(edit_options, marks=Marks(masks))
         notes = []
         if not scene and (foreign := say_foreign(editor)):
             notes.append(foreign)
@@ -224,36 +227,22 @@ def edit(
             check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
             if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
-                notes.append(note)
                 warnings.warn(note, InputWarning, stacklevel=1)
         planned: dict[str, Any] = {"iterations": fit_iterations, "max_splats": max_splats}
         planned["kind"] = kind and kind[:2]
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(**{k: v for k, v in planned.items() if v is not None}),
-            notes=notes, origin=origin, exposures={} if ply is None else read_exposures(ply),
+            notes=lambda: [*notes, *warned()], origin=origin,
+            exposures={} if ply is None else read_exposures(ply),
             budget=budget, asked=asked, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
-        if little := say_little(result.change):
-            warnings.warn(little, InputWarning, stacklevel=1)
-        moved, warned = say_drift(result.drift)
-        if warned:
-            warnings.warn(moved, InputWarning, stacklevel=1)
         views = len(result.edited)
         carried = ""
         if getattr(settings, "a0", 0) > 0 and views > 1:
             share = result.counters["injected"]
             carried = f"; {share:.0%} of the targets' pixels got features of the source"
-            if share < NO_FEATURES:
-                model = "the fitted splats do" if ply is None else f"{ply} does"
-                warnings.warn(
-                    "each view was edited alone, as none got features of the source: perhaps"
-                    f" {model} not fit the photographs, or no other view sees what --source sees,"
-                    f" or masks leave nothing; {out / 'masks'} shows where features went",
-                    InputWarning,
-                    stacklevel=1,
-                )
         ended = f"; cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(
             f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in"

@@ -40,7 +40,7 @@ NOTHING = "stopped; nothing was written"
 
 
 _program = "attnwarp"
-_printed: set[str] = set()
+_printed: dict[str, None] = {}
 _stop_told = False
 """True once a line has told that the command was stopped."""
 
@@ -68,8 +68,13 @@ def log(message: str) -> None:
 def warn(text: str) -> None:
     """Print a warning on stderr, once per command, since inputs are read repeatedly."""
     if text not in _printed:
-        _printed.add(text)
+        _printed[text] = None
         log(f"warning: {text}")
+
+
+def warned() -> list[str]:
+    """List the command's warnings so far, in order."""
+    return [*_printed]
 
 
 @contextmanager

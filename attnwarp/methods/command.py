@@ -39,9 +39,11 @@ from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, MethodSettings, Result
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
+from attnwarp.methods.change import say_drift, say_little
 from attnwarp.methods.features import Features
 from attnwarp.methods.marks import (
     HOW,
+    MARKED,
     Marks,
     check_middle,
     lifted_segments,
@@ -49,6 +51,8 @@ from attnwarp.methods.marks import (
     read_over_black,
     say_unmarked,
     source_mask,
+    typed,
+    write_marked,
 )
 from attnwarp.methods.page import show_edit
 from attnwarp.methods.page.orbit import check_film
@@ -62,6 +66,9 @@ from attnwarp.warp import piece_around
 from attnwarp.workdir import FORMAT, Budget
 
 FIT_FOLDER = "fit"
+
+NO_FEATURES = 0.001
+"""Share of warped target pixels below which each view was effectively edited alone."""
 
 MOST_NAMES = 5
 """Largest number of view names in one line."""
@@ -114,7 +121,7 @@ def edit_dataset(
     *,
     fit_plan: FitPlan | None = None,
     source_picture: Path | None = None,
-    notes: Sequence[str] = (),
+    notes: Callable[[], Sequence[str]] = tuple,
     origin: str = "",
     exposures: Mapping[str, npt.NDArray[np.float64]] = MappingProxyType({}),
     report: Reporter,
@@ -127,6 +134,7 @@ def edit_dataset(
         splats: the scene before the edit; None fits it first.
         editor_name: name or path, see :func:`attnwarp.editing.small.load_editor`.
         source_picture: file of the source view edited elsewhere, for attention warping.
+        notes: gives the warnings of the command so far, for the page.
         origin: sentence on the origin of the inputs, for the page.
         exposures: (3, 4) change of colour of views, by their names; see
             :func:`attnwarp.fit.read_exposures`.
@@ -194,13 +202,29 @@ def edit_dataset(
     if result.gaussians.kind == "2d":
         # Other programs cannot read splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
+    for text in advice(result, settings, out):
+        warnings.warn(text, InputWarning, stacklevel=1)
     # A bundled editor takes seconds, so it also edits the views alone.
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views, turntable=options.turntable, report=report,
-        editor=editor if control else None, notes=notes, origin=origin,
+        editor=editor if control else None, notes=notes(), origin=origin,
     )  # fmt: skip
     return result, page
+
+
+def advice(result: Result, settings: MethodSettings, out: Path) -> list[str]:
+    """List what is wrong with a finished edit, and what to do about it."""
+    moved, warns = say_drift(result.drift)
+    texts = [say_little(result.change) or "", moved if warns else ""]
+    carries = getattr(settings, "a0", 0) > 0 and len(result.edited) > 1
+    if carries and result.counters["injected"] < NO_FEATURES:
+        texts.append(
+            "each view was edited alone, as none got features of the source: perhaps the splats do"
+            " not fit the photographs, or no other view sees what --source sees, or masks leave"
+            f" nothing; {out / 'masks'} shows where features went"
+        )
+    return [text for text in texts if text]
 
 
 def _by_hand(
@@ -278,6 +302,10 @@ def marked(
         return mask
 
     early = None if marks.at is not None else of_source()
+    if early is None:
+        everything = np.ones((camera.height, camera.width), bool)
+        write_marked(marks, views.picture(index), everything, size, out)
+        report.log(f"--at {typed(marks, size)} is drawn in {out / MARKED}")
 
     def segments(splats: Gaussians) -> list[Segment]:
         at = [camera.width / size[0] * v for v in marks.at or ()]

@@ -20,7 +20,7 @@ from attnwarp.fit import Views
 from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
-from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
+from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture, to_bytes
 from attnwarp.reporting import Reporter
 from attnwarp.warp import lift_masks
 from attnwarp.workdir import Workdir
@@ -37,6 +37,12 @@ POOR = 0.8
 
 KEPT = 0.1
 """Share of the middle of a mark that the lifted mask must keep."""
+
+HARDLY = 0.5
+"""Share of the source view from which on a click marks hardly one thing."""
+
+MARKED = "marked.png"
+"""File of an edit's folder: its source view with the mark, unlit outside the mask."""
 
 CLICKED = 2.0
 """Radius of the middle of a click, px."""
@@ -86,6 +92,11 @@ class Marks:
     def option(self) -> str:
         """Name of the given option; empty for none."""
         return "".join(self._given)
+
+    @property
+    def pixels(self) -> tuple[float, ...]:
+        """Coordinates of a box or a point, in px; empty for another mark."""
+        return self.box or self.at or ()
 
     @property
     def of_source(self) -> bool:
@@ -165,8 +176,54 @@ def source_mask(
         mask = snap(to_float(image), piece)
     else:
         mask = picture_mask(marks, image, size)
-    report.log(f"{marks.option} marks {mask.mean():.1%} of the source view {camera.name}")
+    write_marked(marks, image, mask, size, out)
+    what = f"{marks.option} {typed(marks, size)}".strip()
+    report.log(f"{what} marks {mask.mean():.1%} of the source view {camera.name}: {out / MARKED}")
+    if marks.at is not None:
+        warn_of_much(mask, f": look at {out / MARKED}")
     return mask
+
+
+def warn_of_much(mask: Mask, more: str = "") -> None:
+    """Warn of a click's mask, (H, W) bool, that is hardly of one thing."""
+    edges = sum(bool(line.any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+    if edges >= 2 or mask.mean() >= HARDLY:
+        reached = f"reaches {edges} edges" if edges >= 2 else "covers half"
+        warnings.warn(
+            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; --box"
+            " X0,Y0,X1,Y1 of `attnwarp edit` marks the thing by a box",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def typed(marks: Marks, size: tuple[int, int]) -> str:
+    """Write a box's or a point's coordinates with the size that they refer to, else nothing."""
+    numbers = ",".join(f"{v:g}" for v in marks.pixels)
+    return f"{numbers} of {size[0]} x {size[1]} px" if numbers else ""
+
+
+def write_marked(
+    marks: Marks, image: npt.NDArray[Any], mask: Mask, size: tuple[int, int], out: Path
+) -> None:
+    """Write :data:`MARKED`, so that a wrong mark is seen before minutes of work.
+
+    Args:
+        mask: (H, W) bool what is edited, all True while that is unknown.
+        size: width and height, in px, of the file that coordinates refer to.
+    """
+    import cv2
+
+    picture = np.ascontiguousarray(to_bytes(to_float(image) * np.where(mask, 1, 0.3)[..., None]))
+    h, w = mask.shape
+    at = [round(v * s) for v, s in zip(marks.pixels, [w / size[0], h / size[1]] * 2, strict=False)]
+    for color, width in (((0, 0, 0), 3), ((255, 255, 0), 1)):
+        if marks.box is not None:
+            cv2.rectangle(picture, at[:2], at[2:], color, width)
+        elif marks.at is not None:
+            cv2.drawMarker(picture, at, color, cv2.MARKER_CROSS, 9, width)
+    out.mkdir(parents=True, exist_ok=True)
+    Workdir(out, "an edit").write_picture(MARKED, picture)
 
 
 def mask_by_words(

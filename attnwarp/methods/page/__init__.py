@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from html import escape
 from importlib.resources import files
@@ -131,12 +132,12 @@ class _Page:
         change = self.result["change"]
         said, little = say_change(change, self.segments is not None), say_little(change)
         moved, warned = say_drift(self.result["drift"])
-        notes = (little, *given, moved if warned else "")
+        notes = dict.fromkeys([little, *given, moved if warned else ""])
         lines = [
             f"<h1>{escape(self.manifest['instruction'])}</h1>",
-            f"<p><b>{said[0].upper()}{said[1:]}.</b></p>",
-            *(f"<p><b>Warning:</b> {escape(text)}.</p>" for text in notes if text),
-            *([] if warned else [f"<p>{escape(moved[0].upper() + moved[1:])}.</p>"]),
+            f"<p><b>{_prose(said[0].upper() + said[1:])}.</b></p>",
+            *(f"<p><b>Warning:</b> {_prose(text)}.</p>" for text in notes if text),
+            *([] if warned else [f"<p>{_prose(moved[0].upper() + moved[1:])}.</p>"]),
             f"<p>Edited by the method <code>{escape(method)}</code>: {len(self.edited)} of"
             f" {len(self.names)} views were edited, and the splats were tuned on them{ended}."
             " The edited scene is <code>edited.ply</code> in this folder"
@@ -146,7 +147,7 @@ class _Page:
                 else ""
             )
             + ".</p>",
-            *(f"<p>{escape(text)}.</p>" for text in (origin,) if text),
+            *(f"<p>{_prose(text)}.</p>" for text in (origin,) if text),
         ]
         return "\n".join(lines)
 
@@ -391,6 +392,11 @@ class _Page:
 
     def _read(self, file: str) -> Bytes | None:
         return self.folder.read_picture(file) if self.folder.has(file) else None
+
+
+def _prose(text: str) -> str:
+    """Write a message for a terminal as HTML: what is in backticks is code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def _file(name: str) -> str:

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import cv2
@@ -33,11 +35,20 @@ from attnwarp.fit.views import to_float
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 from attnwarp.methods import PRESETS
+from attnwarp.methods.change import net_change
 from attnwarp.methods.command import _masks, mask_files
-from attnwarp.methods.marks import Marks, check_middle, mask_by_words, read_mask, read_over_black
+from attnwarp.methods.marks import (
+    Marks,
+    check_middle,
+    mask_by_words,
+    read_mask,
+    read_over_black,
+    source_mask,
+)
 from attnwarp.methods.scene import near_of
 from attnwarp.methods.tuning import Tuning
 from attnwarp.render import render
+from attnwarp.reporting import SILENT
 from attnwarp.warp import lift_masks, piece_around
 
 runner = CliRunner()
@@ -282,11 +293,37 @@ def test_a_box_marks_what_opencv_cuts_out_and_a_click_its_surface(place, tmp_pat
     else:
         mask = snap(source, piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20)))
     file, ply = save_mask(mask, tmp_path / "mask.png"), ("--ply", place / "splats.ply")
-    assert run(place, tmp_path / "a", *ply, option, value).exit_code == 0
+    done = run(place, tmp_path / "a", *ply, option, value)
+    assert done.exit_code == 0
+    assert f"{option} {value} of 32 x 32 px marks" in " ".join(done.stderr.split())
+    lit = read_image(tmp_path / "a" / "marked.png").astype(float)
+    shown = 255 * source * np.where(mask, 1, 0.3)[..., None]
+    drawn = (np.abs(lit - shown) > 1).any(-1)  # the box or the cross
+    assert 0 < drawn.mean() < 0.3 and drawn[:4].sum() < 60
     assert run(place, tmp_path / "b", *ply, "--mask", file).exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
         assert one == two
+
+
+@pytest.mark.parametrize(("rows", "columns", "said"), [
+    (slice(20, 32), slice(0, 9), "reaches 2 edges"), (slice(4, 31), slice(1, 30), "covers half"),
+    (slice(20, 32), slice(4, 20), ""),
+])  # fmt: skip
+def test_a_click_that_marks_hardly_one_thing_says_so(tmp_path, rows, columns, said):
+    mask = np.zeros((32, 32), bool)
+    mask[rows, columns] = True
+    marks = Marks(mask=save_mask(mask, tmp_path / "mask.png"))
+    image, camera = np.full((32, 32, 3), 0.5), cameras()[0]
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        patch.setattr("attnwarp.methods.marks.snap", lambda image, piece: piece)
+        for one, piece in ((Marks(at=(8, 25)), mask), (marks, None)):
+            source_mask(one, camera, image, tmp_path / "mask.png", (64, 64), tmp_path, "cpu",
+                        SILENT, piece)  # fmt: skip
+    texts = [str(one.message) for one in warned]
+    assert len(texts) == bool(said)  # of the click alone
+    assert all(said in text and "--box" in text and "marked.png" in text for text in texts)
 
 
 MASKS = {
@@ -530,13 +567,37 @@ def test_an_edit_begins_with_how_much_it_changed_inside_the_mask(place, tmp_path
     change = json.loads((out / "result.json").read_text())["change"]
     assert change["scene"] == 0  # not tuned
     assert change["source view"] == pytest.approx(expected, abs=0.01)
-    line = f"inside the mask the scene changed by 0.0 dE00, the source view by {expected:.1f}"
-    assert result.stdout.splitlines()[0] == line
+    line = (
+        "inside the mask the scene changed by 0.0 dE00, net of tuning, the source view by"
+        f" {expected:.1f}: the scene took 0 % of that; 0 % of the mask changed"
+    )
+    assert result.stdout.splitlines()[0].startswith(line)
     page = (out / "index.html").read_text()
     first = re.search(r"</h1>\s*<p>(.*?)</p>", page)[1]
     assert line[1:] in first
     for said in (result.stderr, page):
         assert "the splats hardly took the edit" in " ".join(said.split())
+
+
+@pytest.mark.parametrize(("edit", "taken", "scene", "changed", "worst"), [
+    (0, 0, 0, 0, None),  # nothing was edited: tuning alone removes the splats' misfit of 11 dE
+    (20, 1, 20, 1, ["b", 1.0]), (20, 0.4, 8, 1, ["b", 0.4]), (20, 0, 0, 0, ["b", 0.0]),
+])  # fmt: skip
+def test_the_change_of_a_scene_is_net_of_what_tuning_alone_changes(
+    edit, taken, scene, changed, worst
+):
+    draw, views = np.random.default_rng(0), {}
+    for name in ("source", "a", "b"):
+        photograph = draw.uniform([30, 0, 0], [50, 1, 1], (400, 3))
+        misfit = draw.normal(size=(400, 3)) * [11, 0, 0]  # of the splats, before tuning
+        step = np.array([edit, 0, 0])
+        views[name] = photograph, photograph + step, photograph + misfit, photograph + taken * step
+    change = net_change(views, "source")
+    brighter = deltaE_ciede2000(views["a"][0], views["a"][1]).mean() / (edit or 1)
+    assert change["scene"] == pytest.approx(scene * brighter, rel=0.01, abs=1e-6)
+    assert change["changed"] == changed
+    assert (change["worst"] is None) == (worst is None)
+    assert worst is None or change["worst"][1] == pytest.approx(worst[1], abs=0.01)
 
 
 def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(place, tmp_path):
@@ -643,7 +704,10 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     names = ", ".join(f"images/v{k}.png" for k in (0, 1, 3, 4))
     assert f"--masks: 4 of 5 are black, so nothing is edited in {names}\n" in result.stderr
     assert "warning: each view was edited alone, as none got features" in result.stderr
-    assert f"perhaps {place / 'splats.ply'} does not fit the photographs" in result.stderr
+    assert "perhaps the splats do not fit the photographs" in result.stderr
+    page = unescape((tmp_path / "out" / "index.html").read_text())
+    warned = re.findall(r"^attnwarp: warning: (.*)$", result.stderr, re.MULTILINE)
+    assert len(warned) >= 2 and all(f"<b>Warning:</b> {text}." in page for text in warned)
     result = run(place, tmp_path / "all", *ply)
     assert result.exit_code == 0 and "edited alone" not in result.stderr
     assert "in place of" not in result.stderr
