@@ -104,12 +104,6 @@ def edit(
     change: Annotated[
         list[str] | None, of_method("Any other setting of the preset.", "NAME=VALUE", "--set")
     ] = None,
-    fit_iterations: Annotated[
-        int | None, of_splats("Of the fit, without --ply (3000).", "N", min=1)
-    ] = None,
-    max_splats: Annotated[
-        int | None, of_splats("Most that a fit grows (30000).", "N", min=1)
-    ] = None,
     kind: Annotated[
         Kind | None, of_splats("Of the fit, 2dgs or 3dgs, or of the PLY, whatever it says.", "KIND")
     ] = None,
@@ -160,11 +154,9 @@ def edit(
         if scene:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], flags)
-        _check_splat_options(
-            ply,
-            of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
-            of_file={"--antialiased": antialiased, "--screen-filter": screen_filter},
-        )
+        for name, value in {"antialiased": antialiased, "screen-filter": screen_filter}.items():
+            if ply is None and value is not None:
+                raise ValueError(f"--{name}: says how a PLY is read, and none is given; see --ply")
         check_out(out)
         results = ("edited.ply", "edited-3dgs.ply")
         files = [path for path in (source_picture, ply, editing.mask) if path is not None]
@@ -201,8 +193,7 @@ def edit(
         for path in files:
             existing_file(path)
         typed = {
-            "scene": scene, "editor": editor, "fit_iterations": fit_iterations,
-            "max_splats": max_splats, "kind": kind,
+            "scene": scene, "editor": editor, "kind": kind,
             **{name: value for name, value in vars(editing).items() if name in DECIDING},
         }  # fmt: skip
         asked = {k: v if v is None else str(v) for k, v in typed.items()}
@@ -211,7 +202,7 @@ def edit(
         if scene:
             data = out / "scene"
             origin = capture(scene, data, report)
-            if (ply, fit_iterations, max_splats, kind) == (None,) * 4:
+            if ply is None and kind is None:
                 ply = data / "splats.ply"
         dataset = read_views(data, reading)
         check_marked(edit_options, dataset)
@@ -228,11 +219,9 @@ def edit(
             warn_of_misfit(ply, splats, dataset)
             if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
                 warnings.warn(note, InputWarning, stacklevel=1)
-        planned: dict[str, Any] = {"iterations": fit_iterations, "max_splats": max_splats}
-        planned["kind"] = kind and kind[:2]
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
-            fit_plan=FitPlan(**{k: v for k, v in planned.items() if v is not None}),
+            fit_plan=FitPlan(kind=kind[:2]) if kind else FitPlan(),
             notes=lambda: [*notes, *warned()], origin=origin,
             exposures={} if ply is None else read_exposures(ply),
             budget=budget, asked=asked, report=report, **own,
@@ -249,14 +238,3 @@ def edit(
             f" {sum(result.seconds.values()):.0f} s{carried}{ended}"
         )
         typer.echo(page)
-
-
-def _check_splat_options(ply: Path | None, of_fit: dict[str, Any], of_file: dict[str, Any]) -> None:
-    """Refuse options that would have no effect."""
-    for name, value in (of_file if ply is None else of_fit).items():
-        if value is not None:
-            raise ValueError(
-                f"{name}: says how a PLY is read, and none is given; see --ply"
-                if ply is None
-                else f"{name}: is of the fit, and --ply gives the splats of {ply}; leave out one"
-            )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,15 +15,12 @@ from attnwarp.cli.options import (
     SEGMENTER,
     AnywayOption,
     AtOption,
-    BoxOption,
     DeviceOption,
     DtypeOption,
     InstructionOption,
     LowMemoryOption,
-    SegmenterOption,
     ThreadsOption,
     WhereOption,
-    check_segmenter,
     option,
 )
 from attnwarp.editing.small import bundled, check_words, guide_of, say_foreign
@@ -34,8 +30,6 @@ from attnwarp.reporting import reporter
 
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Image
-
-TILE_COLUMNS = 5
 
 MOST_STRETCH = 0.03
 """Largest change of a picture's aspect ratio that is not reported."""
@@ -69,17 +63,9 @@ def edit_image(
     image_guidance: Annotated[
         float | None, option("How much the picture counts; the editor's if left out.")
     ] = None,
-    sheet: Annotated[
-        Path | None, option("PNG file for a sheet of the picture after every step.")
-    ] = None,
     mask: Annotated[Path | None, option("Mask of the picture; white is edited.", "FILE")] = None,
-    box: BoxOption = None,
     at: AtOption = None,
     words: WhereOption = None,
-    segmenter: SegmenterOption = None,
-    mask_out: Annotated[
-        Path | None, option("PNG file for the mask that --box, --at or --where gives.")
-    ] = None,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",
     low_memory: LowMemoryOption = False,
@@ -87,34 +73,22 @@ def edit_image(
     anyway: AnywayOption = False,
 ) -> None:
     """Edit a picture by an instruction."""
-    if mask_out is not None and words is None and box is None and at is None:
-        raise ValueError("--mask-out: needs --box, --at or --where, which make the mask")
-    check_segmenter(segmenter, words)
     if guide_of(editor) != "picture":
         raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
     check_words(editor, instruction, anyway=anyway)
     from attnwarp.io.file import check_other
 
-    for path in (out, sheet, mask_out):
-        if path is not None and path.suffix.lower() != ".png":
-            raise ValueError(f"{path}: expected a name that ends in .png")
-        if path is not None and path.is_dir():
-            raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
-        if path is not None:
-            check_other(path, picture, "the picture to edit")
-    outputs = [("--out", out), ("--sheet", sheet), ("--mask-out", mask_out)]
-    for (first, one), (second, other) in combinations(outputs, 2):
-        if one is not None and other is not None and one.resolve() == other.resolve():
-            raise ValueError(f"{first}, {second}: got {one} for both, expected a file for each")
-    from attnwarp.editing.segment import check_marks
-    from attnwarp.methods.marks import Marks, bright_of, numbers, picture_mask, say_unmarked
+    if out.suffix.lower() != ".png":
+        raise ValueError(f"{out}: expected a name that ends in .png")
+    if out.is_dir():
+        raise IsADirectoryError(f"{out}: is a folder, expected a PNG file")
+    check_other(out, picture, "the picture to edit")
+    from attnwarp.editing.segment import check_marks, cut_out
+    from attnwarp.methods.marks import Marks, bright_of, numbers, say_unmarked, warn_of_much
 
-    marks = Marks(
-        mask=mask, box=numbers(box, "X0,Y0,X1,Y1", "--box"), at=numbers(at, "X,Y", "--at"),
-        words=words,
-    )  # fmt: skip
+    marks = Marks(mask=mask, at=numbers(at, "X,Y", "--at"), words=words)
     image = _read(picture)
-    check_marks(image.shape[1], image.shape[0], box=marks.box, at=marks.at)
+    check_marks(image.shape[1], image.shape[0], at=marks.at)
 
     import cv2
     import numpy as np
@@ -149,15 +123,12 @@ def edit_image(
         check.same_aspect(bright.shape, whole.shape[:2], f"--mask: {mask}", "crop or pad it")
         share = cv2.resize(bright.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
     elif words is not None:
-        share = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
-    elif marks.of_source:
-        full = picture_mask(marks, whole, whole.shape[1::-1]).astype(np.float32)
-        share = cv2.resize(full, (w, h), interpolation=cv2.INTER_AREA)
+        share = load_segmenter(SEGMENTER, device=device).segment(image, words)
+    elif marks.at is not None:
+        warn_of_much(full := cut_out(whole, at=marks.at))
+        share = cv2.resize(full.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
     if share is not None:
         share = share[..., None].astype(np.float32)
-        if mask_out is not None:
-            _write(mask_out, np.repeat(share, 3, axis=2))
-    tiles: list[Image] = [image]
     with reporter(title=out.name) as report:
         if foreign := say_foreign(editor):
             report.log(foreign)
@@ -166,8 +137,6 @@ def edit_image(
 
         def on_step(step: int, count: int, latents: Any) -> None:
             report.step(step + 1, count, f"{w} x {h} px")
-            if sheet is not None:
-                tiles.append(model.decode(latents)[0])
 
         regions = None if share is None else [share[..., 0]]
         result = edit(
@@ -181,8 +150,6 @@ def edit_image(
         warnings.warn(little, InputWarning, stacklevel=1)
     # The photograph keeps its detail, and the enlarged change is added.
     _write(out, enlarged_change(whole, masked.astype(np.float32)))
-    if sheet is not None:
-        _write(sheet, _sheet(tiles))
     typer.echo(out)
     left = None if share is None else share[..., 0] == 0
     moved = drift_or_why(image, np.clip(edited, 0, 1), left)
@@ -229,18 +196,6 @@ def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) ->
             InputWarning,
             stacklevel=1,
         )
-
-
-def _sheet(tiles: list[Image]) -> Image:
-    """Arrange pictures in a grid; empty cells are white."""
-    import numpy as np
-
-    blank = np.ones_like(tiles[0])
-    rows = []
-    for start in range(0, len(tiles), TILE_COLUMNS):
-        row = tiles[start : start + TILE_COLUMNS]
-        rows.append(np.concatenate([*row, *[blank] * (TILE_COLUMNS - len(row))], axis=1))
-    return np.concatenate(rows)
 
 
 def _write(path: Path, image: Image) -> None:
