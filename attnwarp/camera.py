@@ -349,3 +349,24 @@ def fundamental(view: Camera, key: Camera) -> Array | None:
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     essential = cross @ pose[:3, :3]
     return np.asarray(np.linalg.inv(key.K).T @ essential @ np.linalg.inv(view.K))
+
+
+def meeting_point(cameras: Sequence[Camera]) -> npt.NDArray[np.float64] | None:
+    """Compute the (3,) world point nearest to all optical axes; None if they are parallel.
+
+    Example:
+        >>> from attnwarp.trial import view
+        >>> bool(np.abs(meeting_point([view(0), view(3, 0)])).max() < 1e-9)
+        True
+        >>> meeting_point([view(0)]) is None
+        True
+    """
+    centers = np.stack([camera.position for camera in cameras])
+    forward = np.stack([camera.forward for camera in cameras])
+    # Least squares over the distances to the axes: sum_i (I - f f^T)(p - c) = 0.
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    middle, system = centers.mean(0), across.sum(0)
+    if not np.linalg.eigvalsh(system)[0] > 1e-3 * len(cameras):
+        return None
+    offset = np.linalg.solve(system, np.einsum("nij,nj->i", across, centers - middle))
+    return np.asarray(middle + offset)

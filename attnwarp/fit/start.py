@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
-from attnwarp.camera import Camera
+from attnwarp.camera import Camera, meeting_point
 from attnwarp.devices import on_cpu_unless_named
 from attnwarp.gaussians import Gaussians, Kind
 
@@ -310,22 +310,16 @@ def random_points(
         raise ValueError(f"count: got {count}, expected at least 1")
     centers = np.stack([camera.position for camera in cameras])
     forward = np.stack([camera.forward for camera in cameras])
-    # Least squares over the distances to the axes: sum_i (I - f f^T)(p - c) = 0.
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    middle = centers.mean(0)
-    A = across.sum(0)
-    meet = np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras)
+    focus = meeting_point(cameras)
     # Opposite axes are parallel, too.
-    if _at_one_place(centers) and (meet or (forward @ forward[0]).min() < 0):
+    if _at_one_place(centers) and (focus is not None or (forward @ forward[0]).min() < 0):
         raise ValueError(
             "cameras: got cameras that all stand at one place and look different ways, so"
             " nothing says how far the scene is; expected first points (ply_file_path, or"
             " COLMAP's)"
         )
-    if meet:
-        focus = middle + np.linalg.solve(A, np.einsum("nij,nj->i", across, centers - middle))
-    else:
-        focus = middle + extent_of(cameras) * forward.mean(0)
+    if focus is None:
+        focus = centers.mean(0) + extent_of(cameras) * forward.mean(0)
     half = float(np.linalg.norm(centers - focus, axis=1).mean())
     random = np.random.default_rng(seed)
     points = focus + half * random.uniform(-1, 1, (count, 3))

@@ -3,7 +3,7 @@
 manifest.json         method, settings, rounds, hashes of the inputs
 rounds/N/NAME.png     edited view of a round; NAME.json: its record
 rounds/N.pt  N.ply    splats after the round's tuning, with and without their optimiser
-masks/  features/     pixels that took injected features; features as colours (attention warping)
+masks/                pixels that took injected features (attention warping)
 segments/             edited region of each view, if segments are given
 views/NAME.png        last edit of each view
 renders/before/ after/  renders of the scene from every view
@@ -59,7 +59,7 @@ from attnwarp.methods.work import Work
 from attnwarp.reporting import PACE_SECONDS, SILENT, Reporter
 from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
 
-FOLDERS = ("rounds", "masks", "features", "segments", "views", "renders/before", "renders/after")
+FOLDERS = ("rounds", "masks", "segments", "views", "renders/before", "renders/after")
 
 VIEWER_PLY = "edited-3dgs.ply"
 """Edited 2D splats as thin 3D splats, for viewers of 3DGS; the command writes this file."""

@@ -1,4 +1,4 @@
-"""Pictures of views: sizes, segments, and feature maps as colours."""
+"""Pictures of views: sizes, segments, masks, and sheets of them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.editing.injection import LayerWarp
-from attnwarp.editing.layers import Layer
-from attnwarp.editing.recording import Recording
 
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -134,76 +131,6 @@ def mask_picture(mask: Tensor) -> Bytes:
     """Draw a mask, (H, W, 3) uint8: True is white."""
     pixels = 255 * mask.to(torch.uint8).cpu().numpy()
     return np.repeat(pixels[..., None], 3, axis=2)
-
-
-class Principal:
-    """Three principal components of a source's feature map, as colours.
-
-    Args:
-        features: (N, C) features of the source, which define the basis and the range of the
-            colours, so that equal features of other views have equal colours.
-    """
-
-    def __init__(self, features: Tensor) -> None:
-        values = features.detach().cpu().double()
-        self.mean = values.mean(dim=0)
-        centered = values - self.mean
-        _, vectors = torch.linalg.eigh(centered.T @ centered)
-        basis = vectors.flip(-1)[:, :3]
-        # An eigenvector's sign is arbitrary.
-        largest = basis.abs().argmax(dim=0)
-        basis = basis * basis.gather(0, largest[None]).sign()
-        self.basis = torch.nn.functional.pad(basis, (0, 3 - basis.shape[1]))
-        projected = centered @ self.basis
-        self.low, self.high = projected.quantile(0.01, dim=0), projected.quantile(0.99, dim=0)
-
-    def colors(self, features: Tensor) -> Tensor:
-        """Map (N, C) features to colours, (N, 3) float64 in [0, 1]."""
-        projected = (features.detach().cpu().double() - self.mean) @ self.basis
-        return ((projected - self.low) / (self.high - self.low).clamp_min(1e-12)).clamp(0, 1)
-
-    def picture(self, features: Tensor, size: Size, mask: Tensor | None = None) -> Bytes:
-        """Draw (h w, C) features, (h, w, 3) uint8; black outside the mask."""
-        colors = self.colors(features)
-        if mask is not None:
-            colors = torch.where(mask.reshape(-1, 1).cpu(), colors, 0.0)
-        return to_bytes(colors.reshape(*size, 3).numpy())
-
-
-class FeaturePictures:
-    """Recorded features of one layer as colours, half-way through the recorded steps."""
-
-    def __init__(self, first: Recording) -> None:
-        self._principal = Principal(self._of(first)[1])
-
-    def of_source(self, recording: Recording, shape: tuple[int, ...]) -> Bytes:
-        """Draw a source's features at the size of its view, (H, W, 3) uint8."""
-        layer, features = self._of(recording)
-        size = layer.size(recording.plan.latent_size)
-        return enlarged(self._principal.picture(features, size), (shape[0], shape[1]))
-
-    def of_target(
-        self,
-        recording: Recording,
-        warp: LayerWarp,
-        latent_size: Size,
-        shape: tuple[int, ...],
-    ) -> Bytes:
-        """Draw the source's features warped to a target, (H, W, 3) uint8; black where none are."""
-        layer, features = self._of(recording)
-        size = layer.size(latent_size)
-        grid = warp.at(size, source_size=layer.size(recording.plan.latent_size))
-        warped = grid.warp_tokens(features[None].cpu())[0]
-        picture = self._principal.picture(warped, size, grid.weight > 0)
-        return enlarged(picture, (shape[0], shape[1]))
-
-    def _of(self, recording: Recording) -> tuple[Layer, Tensor]:
-        """Select the displayed layer and its (h w, C) features."""
-        plan = recording.plan
-        layer = min(plan.layers, key=lambda layer: (layer.level, layer.kind != "self"))
-        numbers = sorted(plan.recorded)
-        timestep = recording.timesteps[numbers[len(numbers) // 2]]
-        return layer, recording.features(timestep, layer, plan.keep[0])[0].float()
 
 
 TILE = 160, 480

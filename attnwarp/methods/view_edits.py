@@ -30,7 +30,6 @@ from attnwarp.methods.features import Features
 from attnwarp.methods.geometry import Geometry, Warps
 from attnwarp.methods.padding import ZeroPadded
 from attnwarp.methods.pictures import (
-    FeaturePictures,
     Image,
     check_view_aspect,
     mask_picture,
@@ -376,19 +375,12 @@ class ViewEdits:
         """Collect a view's edit with its record and pictures."""
         about: dict[str, Any] = {"injected": 0.0}
         pictures, recording = {}, self.recorded.recording
-        shape = self.work.views.images[view].shape[:2]
         if view == self.source:
             about["feature_bytes"] = 0 if recording is None else recording.plan.bytes
-            if recording is not None:
-                pictures["features"] = FeaturePictures(recording).of_source(recording, shape)
         elif warp is not None and recording is not None:
             about["injected"] = float(warp.mask.float().mean())
             about["rules"] = {k: float(rule.float().mean()) for k, rule in warp.rules.items()}
             pictures["masks"] = mask_picture(warp.mask)
-            layers, size = self.of_features(warp), self.latent_size(view)
-            assert layers is not None
-            shown = FeaturePictures(recording)
-            pictures["features"] = shown.of_target(recording, layers, size, shape)
         return ViewEdit(picture, about, pictures)
 
     def clear(self) -> None:

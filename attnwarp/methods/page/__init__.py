@@ -209,7 +209,7 @@ class _Page:
 
     def views(self) -> str:
         """Write rows of pictures, a column for each view."""
-        carried = any(self.folder.has(f"features/{name}.png") for name in self.shown)
+        carried = any(self.folder.has(f"masks/{name}.png") for name in self.shown)
         rows: list[tuple[str, str, Callable[[str], Bytes | None]]] = [
             ("Photograph", "photograph", self._photograph),
             ("Edited view", "edited", lambda name: self._read(f"views/{name}.png")),
@@ -222,8 +222,6 @@ class _Page:
             ("Where features came from: white from the source, black from none",
              "where features came from",
              lambda name: self._read(f"masks/{name}.png")),
-            ("Features of the source, warped to the view; their three main components as colours",
-             "features", lambda name: self._read(f"features/{name}.png")),
         ]  # fmt: skip
         cells = [f'<span class="small">{escape(self._title(name))}</span>' for name in self.shown]
         for title, what, picture in rows:

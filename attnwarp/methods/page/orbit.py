@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.camera import Camera
+from attnwarp.camera import Camera, meeting_point
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.file import write_atomically
@@ -48,14 +48,10 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
         seen = (z > 0) & (xy >= 0).all(axis=1) & (xy <= (camera.width, camera.height)).all(axis=1)
         depths += [float(np.median(z[seen]))] if seen.any() else []
     ahead = positions + axes * (np.median(depths) if depths else 1.0)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    system, right = across.sum(axis=0), (across @ positions[:, :, None]).sum(axis=0)[:, 0]
-    # A small weight of the points ahead decides if the axes do not.
-    grain = 1e-9 * len(cameras)
-    point = np.linalg.solve(system + grain * np.eye(3), right + grain * ahead.mean(axis=0))
-    parallel = np.linalg.eigvalsh(system)[0] < 1e-3 * len(cameras)
-    behind = ((point - positions) * axes).sum(axis=1).mean() <= 0
-    return np.asarray(ahead.mean(axis=0) if parallel or behind else point)
+    point = meeting_point(cameras)
+    if point is None or ((point - positions) * axes).sum(axis=1).mean() <= 0:
+        return np.asarray(ahead.mean(axis=0))
+    return point
 
 
 def degrees_apart(one: Camera, other: Camera, middle: Array) -> float:

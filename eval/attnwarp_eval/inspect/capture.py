@@ -131,11 +131,6 @@ class Edit:
         """(h, w, 3) render of the scene after a step; None if the edit has not written it."""
         return self._picture(f"renders/after/{view}.png") if step == EDITED else None
 
-    def details(self, view: str) -> dict[str, Image]:
-        """Further pictures of a view, by title."""
-        features = self._picture(f"features/{view}.png")
-        return {} if features is None else {"features, warped": features}
-
     def _picture(self, name: str) -> Image | None:
         """(h, w, 3) sRGB of a file of the folder; None if the edit has not written it."""
         path = self.path / name

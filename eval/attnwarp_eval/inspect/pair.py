@@ -486,8 +486,6 @@ class Pair:
         parts["source, warped"] = self._warped(next(iter(parts.values())), layer)
         title = "mask" if self.truth is None else "mask against truth"
         parts[title] = self.colors("mask", layer)
-        if self.edit is not None:
-            parts |= self.edit.details(self.target)
         return parts
 
     def _warped(self, source: Image, layer: Size | None) -> Image:

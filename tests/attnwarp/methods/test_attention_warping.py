@@ -304,10 +304,9 @@ def test_the_folder_holds_what_a_person_wants(finished, scene):
     names = {Path(camera.name).stem for camera in scene[1]}
     edited = {Path(scene[1][view].name).stem for view in plan(result).edited}
     for part, expected in (
-        ("views", edited), ("masks", edited - {"v0"}), ("features", edited), ("renders/before", names), ("renders/after", names),
+        ("views", edited), ("masks", edited - {"v0"}), ("renders/before", names), ("renders/after", names),
     ):  # fmt: skip
         assert {path.stem for path in (folder / part).glob("*.png")} == expected
-    assert (folder / "features/v0.png").is_file()
     assert not (folder / ".recording").exists()
     last = read_ply(folder / "rounds" / "2.ply")
     assert torch.equal(read_ply(folder / "edited.ply").means, last.means)
@@ -504,7 +503,7 @@ def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
         attention_warping(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
 
 
-@pytest.mark.parametrize("part", further("features", "masks", "features/v0.png"))
+@pytest.mark.parametrize("part", further("masks"))
 def test_pictures_of_where_features_went_are_drawn_again(part, finished, scene, editor, tmp_path):
     """Oracle: the bytes of the edit that nobody touched."""
     folder = shutil.copytree(finished[1], tmp_path / "folder")
@@ -523,25 +522,20 @@ def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
     """
     folder = shutil.copytree(finished[1], tmp_path / "folder")
     other = np.zeros_like(read_image(folder / "rounds/1/v0.png"))
-    for part, place in (
-        ("features/v0.png", "rounds/1/v0.png"),
-        ("masks/v{}.png", "rounds/2/v{}.png"),
-    ):
-        copy, view = tmp_path / part[:5], plan(finished[0]).stages[1][0]
-        shutil.copytree(folder, copy)
-        (copy / part.format(view)).unlink()
-        path = copy / place.format(view)
-        path.write_bytes(encode_png(other))
-        record = path.with_suffix(".json")
-        sha256 = digest(other)
-        record.write_text(json.dumps(json.loads(record.read_text()) | {"sha256": sha256}))
-        for _ in range(2):  # the second sitting knows as much as the first
-            with (
-                pytest.warns(InputWarning, match="missing"),
-                pytest.raises(InputError, match="edit is not the one that"),
-            ):
-                run(scene, editor, copy)
-            assert np.array_equal(read_image(path), other)
+    view = plan(finished[0]).stages[1][0]
+    (folder / f"masks/v{view}.png").unlink()
+    path = folder / f"rounds/2/v{view}.png"
+    path.write_bytes(encode_png(other))
+    record = path.with_suffix(".json")
+    sha256 = digest(other)
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"sha256": sha256}))
+    for _ in range(2):  # the second sitting knows as much as the first
+        with (
+            pytest.warns(InputWarning, match="missing"),
+            pytest.raises(InputError, match="edit is not the one that"),
+        ):
+            run(scene, editor, folder)
+        assert np.array_equal(read_image(path), other)
 
 
 @pytest.mark.parametrize("place", further("rounds/1/v0.png", "rounds/2/*.png"))
@@ -569,7 +563,7 @@ def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
 
 
 @pytest.mark.parametrize(
-    "name", further("features/v0.png", "edited.ply", "segments/x.png", "views/x.json")
+    "name", further("masks/v0.png", "edited.ply", "segments/x.png", "views/x.json")
 )
 def test_a_persons_files_where_results_go_are_left_alone(name, scene, editor, tmp_path):
     path = tmp_path / name
@@ -1097,7 +1091,6 @@ def test_an_edit_with_features_of_chosen_steps_is_written_and_resumed(scene, edi
         for name in ("some", "all")
     )
     assert 2 * some == everything
-    (tmp_path / "some" / "features/v0.png").stat()
     again = run(scene, editor, tmp_path / "some", settings)
     for view, picture in first.edited.items():
         assert (again.edited[view] == picture).all()

@@ -6,7 +6,6 @@ import torch
 
 from attnwarp import Camera
 from attnwarp.methods.pictures import (
-    Principal,
     check_view_aspect,
     composite,
     edit_size,
@@ -85,24 +84,6 @@ def test_a_blurred_segment_is_a_gaussian_step():
     # A pixel at distance d from the edge sees the normal tail; sampled at pixels, cut at 4 sigma.
     expected = norm.cdf((32 - (np.arange(65) + 0.5)) / 1.5)
     assert np.abs(row - expected)[8:-8].max() < 0.01
-
-
-def test_colours_are_the_first_three_principal_components():
-    random = np.random.default_rng(0)
-    values = (
-        random.normal(size=(500, 6))
-        * [9, 1, 5, 0.5, 3, 0.1]
-        @ np.linalg.qr(random.normal(size=(6, 6)))[0]
-    )
-    centered = values - values.mean(0)
-    _, _, rows = np.linalg.svd(centered, full_matrices=False)
-    colors = Principal(torch.from_numpy(values)).colors(torch.from_numpy(values)).numpy()
-    for k in range(3):
-        expected = centered @ rows[k]
-        low, high = np.quantile(expected, [0.01, 0.99])
-        scaled = np.clip((expected - low) / (high - low), 0, 1)
-        either = min(np.abs(colors[:, k] - scaled).max(), np.abs(colors[:, k] - (1 - scaled)).max())
-        assert either < 1e-9
 
 
 def test_sides_are_the_multiples_nearest_to_the_size_asked_for():

@@ -267,7 +267,7 @@ def test_eight_insets_are_whole_and_their_titles_too(window, monkeypatch):
     to.
     """
     titles = ["source, not edited", "target, not edited", "scene, stage 10", "source, warped",
-              "mask against truth", "features, warped", "true edit", "the last"]  # fmt: skip
+              "mask against truth", "scene, before", "true edit", "the last"]  # fmt: skip
     plain = np.tile(np.float32([1, 0, 1]), (24, 32, 1))
     monkeypatch.setattr(Pair, "insets", lambda *_: dict.fromkeys(titles, plain))
     monkeypatch.setattr(Subject, "steps", ("before", "edited"))
