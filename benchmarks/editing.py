@@ -26,11 +26,11 @@ from typing import Any
 import cv2
 import torch
 
+from attnwarp.command.edit import FitPlan
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.fit import FitSettings, fit, from_points, hold_out, load_views
 from attnwarp.io import read_dataset
 from attnwarp.methods import AttentionWarpingSettings, attention_warping, preset
-from attnwarp.methods.command import FitPlan
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count
 from attnwarp_eval.cost import peak_memory_mb

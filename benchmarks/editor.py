@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from attnwarp.command.marks import read_over_black
 from attnwarp.devices import choose
 from attnwarp.editing.editor import edit
 from attnwarp.editing.layers import choose_layers
@@ -31,7 +32,6 @@ from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.small import dtype_of, load_editor, thread_count
 from attnwarp.io.images import encode_png
 from attnwarp.methods.attention_warping import inject
-from attnwarp.methods.marks import read_over_black
 from attnwarp.methods.pictures import edit_size, resized, to_bytes
 from benchmarks import command
 from benchmarks.injection import INJECTED, PLAIN, RECORDED, WARPED, measure

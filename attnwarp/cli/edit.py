@@ -164,17 +164,17 @@ def edit(
         guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
-        from attnwarp.fit import read_exposures
-        from attnwarp.io.file import existing_file
-        from attnwarp.methods.change import say_change
-        from attnwarp.methods.command import (
+        from attnwarp.command.edit import (
             FitPlan,
             check_asked,
             check_marked,
             edit_dataset,
             view_of,
         )
-        from attnwarp.methods.marks import Marks
+        from attnwarp.command.marks import Marks
+        from attnwarp.fit import read_exposures
+        from attnwarp.io.file import existing_file
+        from attnwarp.methods.change import say_change
 
         edit_options = editing.checked()
         check.one_of(method, list(methods.METHODS), "--method")

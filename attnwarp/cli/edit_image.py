@@ -83,8 +83,8 @@ def edit_image(
     if out.is_dir():
         raise IsADirectoryError(f"{out}: is a folder, expected a PNG file")
     check_other(out, picture, "the picture to edit")
+    from attnwarp.command.marks import Marks, bright_of, numbers, say_unmarked, warn_of_much
     from attnwarp.editing.segment import check_marks, cut_out
-    from attnwarp.methods.marks import Marks, bright_of, numbers, say_unmarked, warn_of_much
 
     marks = Marks(mask=mask, at=numbers(at, "X,Y", "--at"), words=words)
     image = _read(picture)

@@ -15,8 +15,8 @@ from attnwarp import __version__
 from attnwarp.cli.shell import begin
 
 if TYPE_CHECKING:
-    from attnwarp.methods.command import EditOptions
-    from attnwarp.methods.marks import Marks
+    from attnwarp.command.edit import EditOptions
+    from attnwarp.command.marks import Marks
 
 Kind = Literal["2dgs", "3dgs"]
 """Kinds of splats, as commands name them."""
@@ -175,7 +175,7 @@ class Marking:
     def marks(self) -> Marks:
         """Build the marks."""
         check_segmenter(self.segmenter, self.words)
-        from attnwarp.methods.marks import Marks, numbers
+        from attnwarp.command.marks import Marks, numbers
 
         return Marks(
             self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
@@ -209,7 +209,7 @@ class Editing(Marking):
 
     def checked(self) -> EditOptions:
         """Check the options and convert them for an edit."""
-        from attnwarp.methods.command import EditOptions
+        from attnwarp.command.edit import EditOptions
 
         own = {field.name for field in fields(EditOptions)} - {"marks"}
         return EditOptions(self.marks(), **{name: getattr(self, name) for name in own})

@@ -268,7 +268,7 @@ def of_capture(
     variants = _presets(None)
     edit = None
     if path.is_dir():
-        from attnwarp.methods.command import FIT_FOLDER
+        from attnwarp.command.edit import FIT_FOLDER
 
         if not is_edit(path):
             raise InputError(f"{path}: expected splats (.ply, .splat) or a folder of attnwarp edit")

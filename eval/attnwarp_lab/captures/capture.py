@@ -10,13 +10,13 @@ from typing import Any
 
 from attnwarp.camera import Camera
 from attnwarp.cli.files import check_seen, likeness
+from attnwarp.command.edit import marked, view_of
+from attnwarp.command.marks import Marks
 from attnwarp.digest import digest
 from attnwarp.errors import InputError
 from attnwarp.fit import Views, load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_dataset, read_ply
-from attnwarp.methods.command import marked, view_of
-from attnwarp.methods.marks import Marks
 from attnwarp.methods.pictures import Segment
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_lab.captures.manifest import Loaded, MaskPart

@@ -15,6 +15,8 @@ from typing import Any
 
 import torch
 
+from attnwarp.command.edit import mask_files
+from attnwarp.command.page import PAGE, show_edit
 from attnwarp.digest import digest
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.small import (
@@ -31,8 +33,6 @@ from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods import METHODS, Budget, preset
 from attnwarp.methods.base import workdir_of
-from attnwarp.methods.command import mask_files
-from attnwarp.methods.page import PAGE, show_edit
 from attnwarp.methods.pictures import enlarged_change, to_bytes
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.methods.view_edits import check_editor

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from attnwarp import Camera
+from attnwarp.command.edit import mask_files, number_of, view_of
 from attnwarp.errors import InputError
 from attnwarp.io import (
     Dataset,
@@ -20,7 +21,6 @@ from attnwarp.io import (
     read_transforms,
 )
 from attnwarp.io.names import file_stems
-from attnwarp.methods.command import mask_files, number_of, view_of
 
 NAMES = ["images/left/é one.png", "images/right/B.png", "images/c.png"]
 """Names on the disk."""

@@ -15,6 +15,21 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
+from attnwarp.command.marks import (
+    HOW,
+    MARKED,
+    Marks,
+    check_middle,
+    lifted_segments,
+    read_mask,
+    read_over_black,
+    say_unmarked,
+    source_mask,
+    typed,
+    write_marked,
+)
+from attnwarp.command.page import show_edit
+from attnwarp.command.page.orbit import check_film
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import announced
 from attnwarp.editing.segment import Mask, check_marks, segmenter_folders
@@ -41,21 +56,6 @@ from attnwarp.methods import METHODS, MethodSettings, Result
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.change import say_drift, say_little
 from attnwarp.methods.features import Features
-from attnwarp.methods.marks import (
-    HOW,
-    MARKED,
-    Marks,
-    check_middle,
-    lifted_segments,
-    read_mask,
-    read_over_black,
-    say_unmarked,
-    source_mask,
-    typed,
-    write_marked,
-)
-from attnwarp.methods.page import show_edit
-from attnwarp.methods.page.orbit import check_film
 from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.settings import AttentionWarpingSettings, SourceSettings
 from attnwarp.methods.tuning import perceptual_net

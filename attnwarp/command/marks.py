@@ -61,7 +61,7 @@ class Marks:
         InputError: several marks are given, or the words have no letter.
 
     Example:
-        >>> from attnwarp.methods.marks import Marks
+        >>> from attnwarp.command.marks import Marks
         >>> Marks(at=(64, 68)).of_source, Marks().of_source
         (True, False)
     """
@@ -108,7 +108,7 @@ def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | No
     """Parse the numbers of an option such as ``--at 64,68``.
 
     Example:
-        >>> from attnwarp.methods.marks import numbers
+        >>> from attnwarp.command.marks import numbers
         >>> numbers("64,68", "X,Y", "--at")
         (64.0, 68.0)
     """

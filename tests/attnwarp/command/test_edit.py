@@ -30,15 +30,8 @@ from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import GroundedSam, cut_out, snap
-from attnwarp.errors import InputError
-from attnwarp.fit.views import to_float
-from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
-from attnwarp.io.images import encode_png
-from attnwarp.methods import PRESETS
-from attnwarp.methods.change import net_change
-from attnwarp.methods.command import FitPlan, _masks, mask_files
-from attnwarp.methods.marks import (
+from attnwarp.command.edit import FitPlan, _masks, mask_files
+from attnwarp.command.marks import (
     Marks,
     check_middle,
     mask_by_words,
@@ -46,6 +39,13 @@ from attnwarp.methods.marks import (
     read_over_black,
     source_mask,
 )
+from attnwarp.editing.segment import GroundedSam, cut_out, snap
+from attnwarp.errors import InputError
+from attnwarp.fit.views import to_float
+from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
+from attnwarp.io.images import encode_png
+from attnwarp.methods import PRESETS
+from attnwarp.methods.change import net_change
 from attnwarp.methods.scene import near_of
 from attnwarp.methods.tuning import Tuning
 from attnwarp.render import render
@@ -162,7 +162,7 @@ def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_pat
 
 def test_without_splats_it_fits_them_first_at_the_size_of_a_fit(place, tmp_path, monkeypatch):
     monkeypatch.setattr("attnwarp.fit.views.SIZES", {"cpu": 24, "cuda": 24})
-    monkeypatch.setattr("attnwarp.methods.command.FitPlan", partial(FitPlan, 5))
+    monkeypatch.setattr("attnwarp.command.edit.FitPlan", partial(FitPlan, 5))
     result = run(place, tmp_path)
     assert result.exit_code == 0, result.output
     assert "pictures of 32 px are shrunk to 24 (--max-size 32: not)" in result.stderr
@@ -319,7 +319,7 @@ def test_a_click_that_marks_hardly_one_thing_says_so(tmp_path, rows, columns, sa
     image, camera = np.full((32, 32, 3), 0.5), cameras()[0]
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        patch.setattr("attnwarp.methods.marks.snap", lambda image, piece: piece)
+        patch.setattr("attnwarp.command.marks.snap", lambda image, piece: piece)
         for one, piece in ((Marks(at=(8, 25)), mask), (marks, None)):
             source_mask(one, camera, image, tmp_path / "mask.png", (64, 64), tmp_path, "cpu",
                         SILENT, piece)  # fmt: skip
@@ -717,7 +717,7 @@ def test_a_mask_by_words_is_made_once_and_others_write_over_none(place, tmp_path
     image = read_image(place / "data" / "images" / camera.name)
     segmenter, loaded = tiny_segmenter(tmp_path), []
     monkeypatch.setattr(
-        "attnwarp.methods.marks.load_segmenter",
+        "attnwarp.command.marks.load_segmenter",
         lambda name, *, device: loaded.append(name) or segmenter,
     )
     bear = Marks(words="bear", segmenter="dino,sam")

@@ -9,11 +9,11 @@ import pytest
 from tiny_scenes import splats as discs
 
 from attnwarp import Camera
+from attnwarp.command.page import show_edit
 from attnwarp.fit import Views
 from attnwarp.io import read_ply
 from attnwarp.methods import by_view, preset
 from attnwarp.methods.base import workdir_of
-from attnwarp.methods.page import show_edit
 from attnwarp.render import render
 
 pytestmark = [

@@ -12,15 +12,15 @@ import torch
 from PIL import Image
 
 from attnwarp import Camera
+from attnwarp.command import page as pages
+from attnwarp.command.page.measured import disagreement
+from attnwarp.command.page.orbit import check_film, focus_of, orbit, write_film
 from attnwarp.errors import InputError
 from attnwarp.fit import Views
 from attnwarp.io import read_image, read_splat
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, attention_warping, by_view, preset
-from attnwarp.methods import page as pages
 from attnwarp.methods.base import workdir_of
-from attnwarp.methods.page.measured import disagreement
-from attnwarp.methods.page.orbit import check_film, focus_of, orbit, write_film
 from attnwarp.trial import disc
 
 QUICK = {"steps": 2, "iterations": 3}

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.command.page.measured import CONTROL, disagreement, edited_alone, spill
+from attnwarp.command.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
 from attnwarp.editing.editor import Editor
 from attnwarp.fit import Views
 from attnwarp.fit.views import to_float
@@ -28,8 +30,6 @@ from attnwarp.io.names import file_stems
 from attnwarp.io.splat import RECORD
 from attnwarp.methods.base import VIEWER_PLY, edit_file
 from attnwarp.methods.change import say_change, say_drift, say_little
-from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
-from attnwarp.methods.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
 from attnwarp.methods.pictures import Bytes, Mask, resized, to_bytes
 from attnwarp.methods.scene import near_of
 from attnwarp.reporting import SILENT, Reporter
