@@ -24,22 +24,31 @@ FORMATS = (".ply", ".splat")
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="Splats: .ply or .splat.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply or .splat.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="Splats to convert: a .ply or .splat file.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write, .ply or .splat.")],
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     third_scale: Annotated[
-        float | None, option("Write 2DGS as thin 3DGS with this third scale (1e-6).")
+        float | None,
+        option(
+            "Write 2DGS as thin 3DGS with this third scale in scene units (.splat: default 1e-6;"
+            " .ply: default 2DGS as it is).",
+            "SCALE",
+        ),
     ] = None,
     sh_degree: Annotated[
-        int | None, option("Cut harmonics beyond this degree.", min=0, max=3)
+        int | None,
+        option("Cut harmonics beyond this degree, 0 to 3 (default: keep all).", "N", min=0, max=3),
     ] = None,
     coordinates: Annotated[
         Literal["auto", "world", "relative"],
         option(
-            "world, relative to the origin comment that attnwarp alone reads, or auto: world"
-            " unless float32 would lose too much."
+            "Write positions in world coordinates (world), relative to an origin in the file's"
+            " header that attnwarp alone reads (relative), or auto: world unless float32 would lose"
+            " too much."
         ),
     ] = "auto",
 ) -> None:
@@ -84,7 +93,7 @@ def _check_start(path: Path) -> None:
 @options_of(Reading)
 def undistort(
     data: DataArgument,
-    out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write transforms.json and images/ to.")],
     *,
     reading: Reading,
 ) -> None:

@@ -50,19 +50,20 @@ DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_siz
 def edit(
     data: DataArgument,
     instruction: InstructionOption,
+    editor: EditorOption = "small-plain",
     out: Annotated[
         Path | None,
-        option("Of the result, resumed if it is there; in runs/edits if left out.", "FOLDER"),
+        option(
+            "Write the result to this folder, or resume the edit in it (default: one of"
+            " runs/edits, named by DATA and the instruction).",
+            "FOLDER",
+        ),
     ] = None,
-    ply: Annotated[
-        Path | None, option("Splats of the scene; fitted first if left out.", "FILE")
-    ] = None,
-    editor: EditorOption = "small-plain",
     method: Annotated[
         str,
         of_method(
-            "attention_warping, or by_view, igs2gs, dge, gaussctrl, corresponding, fused,"
-            " guided, warped_reference; see docs/method/baselines.md.",
+            "Edit by this method: attention_warping (default), by_view, igs2gs, dge, gaussctrl,"
+            " corresponding, fused, guided or warped_reference; see docs/method/baselines.md.",
             "NAME",
             show_default=False,
         ),
@@ -70,54 +71,103 @@ def edit(
     preset: Annotated[
         str | None,
         of_method(
-            "Its choices (default: extended): corrected, extended, paper, released,"
-            " released-controlnet; see docs/method/algorithm.md.",
+            "Begin with this preset of the method's settings; attention_warping has extended"
+            " (default), corrected, paper, released and released-controlnet; see"
+            " docs/method/algorithm.md.",
             "NAME",
         ),
     ] = None,
     source_picture: Annotated[
-        Path | None, of_method("The source view, edited elsewhere.", "FILE")
+        Path | None,
+        of_method("Take this picture, edited elsewhere, as the source view's edit.", "FILE"),
     ] = None,
-    stages: Annotated[int | None, of_method("Of editing and tuning (3).", "N", min=1)] = None,
+    stages: Annotated[
+        int | None,
+        of_method("Edit and tune in so many stages (default of extended: 3).", "N", min=1),
+    ] = None,
     views_per_stage: Annotated[
-        int | None, of_method("New views that a stage edits.", "N", min=1)
+        int | None,
+        of_method(
+            "Edit so many new views in each stage (default of extended: an equal share).",
+            "N",
+            min=1,
+        ),
     ] = None,
     steps: Annotated[
-        int | None, of_method("Of denoising; the editor's own if left out.", "N", min=1)
+        int | None,
+        of_method("Denoise in so many steps (default: the editor's own number).", "N", min=1),
     ] = None,
     iterations: Annotated[
-        int | None, of_method("Of tuning, in each stage (300).", "N", min=0)
+        int | None,
+        of_method(
+            "Tune the splats for so many iterations in each stage (default of extended: 300).",
+            "N",
+            min=0,
+        ),
     ] = None,
     size: Annotated[
         int | None,
-        option(
-            "Longest side in px to edit at; the editor's own if left out.",
+        of_method(
+            "Edit at this longest side in px; the change is enlarged to the picture's size"
+            " (default: the editor's own size, 128 for a bundled scene).",
             "N",
             min=16,
             max=MOST_PIXELS,
         ),
     ] = None,
     alone: Annotated[
-        bool, of_method("Carry nothing, for comparison.", None, "--each-view-alone")
+        bool,
+        of_method(
+            "Carry no features from view to view, for comparison.", None, "--each-view-alone"
+        ),
     ] = False,
-    seed: Annotated[int | None, option("Of everything random (0).", "N", min=0)] = None,
+    seed: Annotated[
+        int | None, of_method("Draw everything random by this seed (default 0).", "N", min=0)
+    ] = None,
     change: Annotated[
-        list[str] | None, of_method("Any other setting of the preset.", "NAME=VALUE", "--set")
+        list[str] | None,
+        of_method(
+            "Change any other setting of the preset; may be repeated.", "NAME=VALUE", "--set"
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        of_method(
+            "Stop editing and tuning after this many seconds, and write the scene as it is then"
+            " (default: no limit).",
+            "S",
+            min=0,
+        ),
+    ] = None,
+    network_rows: Annotated[
+        int | None,
+        of_method(
+            "Stop before more rows than this go through the network, one a picture, step and"
+            " branch of guidance (default: no limit).",
+            "N",
+            min=0,
+        ),
+    ] = None,
+    ply: Annotated[
+        Path | None,
+        of_splats("Edit these splats (.ply, .splat); without any, they are fitted first.", "FILE"),
     ] = None,
     kind: Annotated[
-        Kind | None, of_splats("Of the fit, 2dgs or 3dgs, or of the PLY, whatever it says.", "KIND")
+        Kind | None,
+        of_splats(
+            "Fit 2dgs (default) or 3dgs; with --ply, read it as this kind, whatever it says.",
+            "KIND",
+        ),
     ] = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     store: Annotated[
         Literal["cpu", "device", "disk"] | None,
-        of_machine("Recorded features: cpu (main memory), device or disk.", "WHERE"),
-    ] = None,
-    seconds: Annotated[
-        float | None, of_method("Begin no edit and no iteration after.", "S", min=0)
-    ] = None,
-    network_rows: Annotated[
-        int | None, of_method("At most, through the network.", "N", min=0)
+        of_machine(
+            "Keep recorded features in main memory (cpu, the default), with the editor (device) or"
+            " on disk.",
+            "WHERE",
+        ),
     ] = None,
     anyway: AnywayOption = False,
     *,

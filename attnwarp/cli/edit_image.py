@@ -37,33 +37,41 @@ MOST_STRETCH = 0.03
 PictureEditorOption = Annotated[
     str,
     option(
-        "A bundled editor that takes pictures, or a folder in diffusers' format.", "NAME|FOLDER"
+        "Edit by this editor: the bundled small-plain, or a folder in diffusers' format.",
+        "NAME|FOLDER",
     ),
 ]
 
 
 def edit_image(
-    picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
+    picture: Annotated[Path, typer.Argument(help="Picture to edit: a PNG, JPEG or TIFF file.")],
     instruction: InstructionOption,
-    out: Annotated[Path, option("PNG file for the result.")],
+    out: Annotated[Path, option("Write the edited picture to this PNG file.", "FILE")],
     editor: PictureEditorOption = "small-plain",
-    seed: Annotated[int, option("Of the noise.", min=0)] = 0,
+    seed: Annotated[int, option("Draw the noise by this seed.", "N", min=0)] = 0,
     steps: Annotated[
-        int | None, option("Of denoising; the editor's own if left out.", min=1, max=1000)
+        int | None,
+        option("Denoise in so many steps (default: the editor's own).", "N", min=1, max=1000),
     ] = None,
     size: Annotated[
         int | None,
         option(
-            "Longest side to work at in px; the editor's own if left out.", min=16, max=MOST_PIXELS
+            "Edit at this longest side in px; the change is enlarged to the picture's size"
+            " (default: the editor's own).",
+            "N",
+            min=16,
+            max=MOST_PIXELS,
         ),
     ] = None,
     text_guidance: Annotated[
-        float | None, option("How much the words count; the editor's if left out.")
+        float | None,
+        option("Weigh the words so much; 1 adds no weight (default: the editor's).", "W"),
     ] = None,
     image_guidance: Annotated[
-        float | None, option("How much the picture counts; the editor's if left out.")
+        float | None,
+        option("Weigh the picture so much; 1 adds no weight (default: the editor's).", "W"),
     ] = None,
-    mask: Annotated[Path | None, option("Mask of the picture; white is edited.", "FILE")] = None,
+    mask: Annotated[Path | None, option("Edit only what is white in this mask.", "FILE")] = None,
     at: AtOption = None,
     words: WhereOption = None,
     device: DeviceOption = "auto",

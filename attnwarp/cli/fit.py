@@ -60,56 +60,79 @@ RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json", "exp
 @options_of(Reading)
 def fit(
     data: DataArgument,
-    out: Annotated[Path, option("Folder for the result; a fit in it is resumed.")],
+    out: Annotated[
+        Path, option("Write the result to this folder, or resume the fit in it.", "FOLDER")
+    ],
     kind: Annotated[
-        Kind | None, option("Flat discs or ellipsoids (default 2dgs, or that of --start).")
+        Kind | None,
+        option(
+            "Fit flat discs (2dgs, the default) or ellipsoids (3dgs); --start has its own kind."
+        ),
     ] = None,
     start: Annotated[
         Path | None,
-        option("Go on from fitted splats (PLY or .splat) in place of points.", "SPLATS"),
+        option("Go on from these splats (.ply, .splat) in place of DATA's points.", "SPLATS"),
     ] = None,
-    iterations: Annotated[int | None, option("Steps, one view each (default 7000).", min=1)] = None,
+    iterations: Annotated[
+        int | None, option("Fit for so many steps, one view each (default 7000).", "N", min=1)
+    ] = None,
     max_seconds: Annotated[
-        float | None, option("Stop after so many seconds of fitting.", min=0)
+        float | None,
+        option("Stop after this many seconds of fitting; the fit can be resumed.", "S", min=0),
     ] = None,
     max_size: MaxSizeOption = None,
     max_splats: Annotated[
         int | None,
         option(
-            "Do not grow the model beyond (default: half of a picture's pixels, or twice the"
-            " first splats if more).",
+            "Grow the model to so many splats at most (default: half of a picture's pixels, or"
+            " twice the first splats if that is more).",
+            "N",
             min=1,
         ),
     ] = None,
     points: Annotated[
-        int | None, option("Random first points, where DATA has none (default 10000).", min=1)
+        int | None,
+        option(
+            "Begin at so many random points where DATA has no points (default 10000).", "N", min=1
+        ),
     ] = None,
     hold_out: Annotated[
         str,
         option(
-            "Hold out one view of so many, 0 none, where DATA names no splits; or these views,"
-            " with commas between.",
+            "Hold out one view of so many from the fit, 0 for none, where DATA names no splits; or"
+            " hold out these views, with commas between their names.",
             "N|NAMES",
         ),
     ] = "8",
-    seed: Annotated[int, option("Seed of everything random.", min=0)] = 0,
+    seed: Annotated[int, option("Draw everything random by this seed.", "N", min=0)] = 0,
     change: Annotated[
         list[str] | None,
-        option("Any other setting; see docs/method/fitting.md.", "NAME=VALUE", "--set"),
+        option(
+            "Change any other setting, see docs/method/fitting.md; may be repeated.",
+            "NAME=VALUE",
+            "--set",
+        ),
     ] = None,
-    checkpoint_seconds: Annotated[float, option("Seconds between two checkpoints.", min=0)] = 30.0,
+    checkpoint_seconds: Annotated[
+        float, option("Write a checkpoint every so many seconds.", "S", min=0)
+    ] = 30.0,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     restart: Annotated[
-        bool, option("Begin again, over the fit in --out.", None, "--restart")
+        bool, option("Begin again, over the fit that --out holds.", None, "--restart")
     ] = False,
     third_scale: Annotated[
-        float | None, option("2dgs: third scale in the PLY, for viewers of 3DGS (1e-6).")
+        float | None,
+        option(
+            "Give discs this third scale in the PLY, in scene units, for viewers of 3DGS, such as"
+            " 1e-6 (default: none is written).",
+            "SCALE",
+        ),
     ] = None,
     *,
     reading: Reading,
 ) -> None:
-    """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
+    """Fit splats to posed pictures. A fit that was stopped goes on when it is started again."""
     stopped = (
         f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
     )

@@ -22,7 +22,7 @@ Kind = Literal["2dgs", "3dgs"]
 """Kinds of splats, as commands name them."""
 
 PANELS = (
-    "What is edited", "The method", "Splats", "The page", "The machine", "Reading DATA",
+    "The mark", "The method", "Splats", "The page", "The machine", "Reading DATA",
 )  # fmt: skip
 """Panels of the help in order, below the panel of common options."""
 
@@ -49,75 +49,123 @@ of_marking, of_method, of_splats, of_page, of_machine, of_reading = (
     functools.partial(option, panel=panel) for panel in PANELS
 )
 
-InstructionOption = Annotated[str, option('What to change, such as "make it red".')]
+InstructionOption = Annotated[str, option('Say what to change, such as "make it red".')]
 
 AnywayOption = Annotated[
     bool,
-    option("Take words of which a bundled editor knows none that tells a look.", None, "--anyway"),
+    option(
+        "Edit even if the words name no look that a bundled editor knows, or nothing in a bundled"
+        " scene, which is then edited as a whole.",
+        None,
+        "--anyway",
+        panel=PANELS[1],
+    ),
 ]
 
 EditorOption = Annotated[
     str,
     option(
-        "A bundled editor, or a folder in diffusers' format; two, BASE,CONTROLNET, for depth.",
-        "NAME",
+        "Edit by this editor: a bundled one, small-plain or small-depth, or a folder in diffusers'"
+        " format; two folders, BASE,CONTROLNET, edit by depth.",
+        "NAME|FOLDER",
     ),
 ]
 
 WhereOption = Annotated[
-    str | None, of_marking('Names of it, such as "bear"; the rest stays.', "WORDS", "--where")
+    str | None,
+    option(
+        'Edit only what these words name in the source view, such as "bear".', "WORDS", "--where"
+    ),
 ]
 
 BoxOption = Annotated[
-    str | None, of_marking("Box around it, px of the (source) picture.", "X0,Y0,X1,Y1")
+    str | None,
+    option(
+        "Edit only the thing in this box: px of the source view's file, from its top left corner.",
+        "X0,Y0,X1,Y1",
+    ),
 ]
 
-AtOption = Annotated[str | None, of_marking("Point on it, px of the (source) picture.", "X,Y")]
+AtOption = Annotated[
+    str | None,
+    option(
+        "Edit only the thing at this point: px of the picture's file, from its top left corner.",
+        "X,Y",
+    ),
+]
 
 SegmenterOption = Annotated[
-    str | None, of_marking("What --where asks: clip-parts, or folders DINO,SAM.", "NAME")
+    str | None,
+    of_marking(
+        "Let this segmenter find the words of --where: clip-parts (default), or the folders of"
+        " Grounding DINO and SAM, DINO,SAM.",
+        "NAME",
+    ),
 ]
 
-ThreadsOption = Annotated[int | None, of_machine("CPU threads; all cores if left out.", "N", min=1)]
+ThreadsOption = Annotated[
+    int | None, of_machine("Use so many CPU threads (default: all cores).", "N", min=1)
+]
 
-DeviceOption = Annotated[str, of_machine("cpu, cuda, or auto: a GPU if there is one.", "NAME")]
+DeviceOption = Annotated[
+    str, of_machine("Compute on cpu, cuda, or auto: a GPU if there is one.", "NAME")
+]
 
 DtypeOption = Annotated[
     str,
     of_machine(
-        "Of the editor: float32, float16, bfloat16, which moves pictures ten times as far, or auto:"
-        " float32 on a processor; on a GPU bfloat16 for FLUX, Qwen and Stable Diffusion 3, else"
-        " float16.",
+        "Compute the editor in float32, float16, bfloat16 (whose pictures differ ten times as"
+        " much), or auto: float32 on a CPU; on a GPU bfloat16 for FLUX, Qwen and Stable Diffusion"
+        " 3, else float16.",
         "TYPE",
     ),
 ]
 
 LowMemoryOption = Annotated[
     bool,
-    of_machine("Weights wait in main memory; pictures are decoded in tiles.", None, "--low-memory"),
+    of_machine(
+        "Keep the editor's weights in main memory until they are needed, and decode pictures in"
+        " tiles: slower, for a GPU too small for the editor.",
+        None,
+        "--low-memory",
+    ),
 ]
 
 DataArgument = Annotated[
-    Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+    Path,
+    typer.Argument(help="Posed pictures: a transforms.json, its folder, or a COLMAP folder."),
 ]
 
 
 MaxSizeOption = Annotated[
-    int | None, of_reading("Shrink larger images to this many px.", "N", min=16)
+    int | None,
+    of_reading("Shrink pictures whose longest side exceeds so many px to that size.", "N", min=16),
 ]
 
 
-SplatKindOption = Annotated[Kind | None, of_splats("Read the file as this kind, whatever it says.")]
+SplatKindOption = Annotated[
+    Kind | None, of_splats("Read the splats as 2dgs or 3dgs, whatever their file says.")
+]
 
 
 ScreenFilterOption = Annotated[
     float | None,
-    of_splats("What the screen adds to 3D splats: 0.3 of 3DGS, 0.1 of Mip-Splatting.", "PX2"),
+    of_splats(
+        "Add this variance to the splats on the screen, in square px: 0.3 as 3DGS, 0.1 as"
+        " Mip-Splatting (default: what their file says, else 0.3).",
+        "PX2",
+    ),
 ]
 
 
 AntialiasedOption = Annotated[
-    bool | None, of_splats("How the splats were fitted.", None, "--antialiased/--no-antialiased")
+    bool | None,
+    of_splats(
+        "Render 3DGS with or without opacity compensation, as the splats were fitted (default: what"
+        " their file says, else without).",
+        None,
+        "--antialiased/--no-antialiased",
+    ),
 ]
 
 
@@ -127,22 +175,37 @@ class Reading:
 
     format: Annotated[
         Literal["transforms", "colmap"] | None,
-        of_reading("transforms or colmap, where DATA holds both.", "NAME"),
+        of_reading("Read this format, transforms or colmap, if DATA holds both.", "NAME"),
     ] = None
-    images: Annotated[Path | None, of_reading("Images of a COLMAP model.", "FOLDER")] = None
+    images: Annotated[
+        Path | None, of_reading("Read the pictures of a COLMAP model from this folder.", "FOLDER")
+    ] = None
     scale: Annotated[
-        int, of_reading("2, 4 or 8: images_N in place of images; cameras are resized.", "N")
+        int,
+        of_reading(
+            "Read the pictures of the folder images_N, which are so many times smaller: 2, 4 or 8.",
+            "N",
+        ),
     ] = 1
     missing_images: Annotated[
         Literal["error", "none"],
-        of_reading("error, or none: leave out cameras whose image is missing.", "WHAT"),
+        of_reading(
+            "Stop at a camera whose picture is missing (error), or leave it out (none).", "WHAT"
+        ),
     ] = "error"
     resize_cameras: Annotated[
-        bool, of_reading("Fit cameras to images of another size.", None, "--resize-cameras")
+        bool,
+        of_reading(
+            "Resize cameras to pictures of another size, which are refused otherwise.",
+            None,
+            "--resize-cameras",
+        ),
     ] = False
     ignore_keys: Annotated[
         list[str] | None,
-        of_reading("Pass over this key of a transforms.json.", "KEY", "--ignore-key"),
+        of_reading(
+            "Pass over this key of a transforms.json; may be repeated.", "KEY", "--ignore-key"
+        ),
     ] = None
 
 
@@ -158,19 +221,25 @@ class Marking:
 
     source: Annotated[
         str | None,
-        of_marking("Name or number of the view that is marked and edited first.", "VIEW"),
+        option(
+            "Mark and edit this view first, by its name or number (default: the first).", "VIEW"
+        ),
     ] = None
-    box: BoxOption = None
     at: AtOption = None
+    box: BoxOption = None
     words: WhereOption = None
-    segmenter: SegmenterOption = None
     mask: Annotated[
         Path | None,
-        of_marking("Mask of the source view, lifted into all; white is edited.", "FILE"),
+        option(
+            "Edit only what is white in this mask of the source view, lifted into all views.",
+            "FILE",
+        ),
     ] = None
     masks: Annotated[
-        Path | None, of_marking("Masks of all views, NAME.png; white is edited.", "FOLDER")
+        Path | None,
+        option("Edit only what is white in these masks: a NAME.png for each view.", "FOLDER"),
     ] = None
+    segmenter: SegmenterOption = None
 
     def marks(self) -> Marks:
         """Build the marks."""
@@ -188,7 +257,12 @@ class Editing(Marking):
     """Options of editing a scene by any method."""
 
     tune_outside: Annotated[
-        bool, of_marking("Tune splats that no mask marks, too.", None, "--tune-outside")
+        bool,
+        of_marking(
+            "Tune all splats, also those that no mask marks, which stay as they are otherwise.",
+            None,
+            "--tune-outside",
+        ),
     ] = False
     max_size: MaxSizeOption = None
     device: DeviceOption = "auto"
@@ -198,13 +272,15 @@ class Editing(Marking):
     control: Annotated[
         bool | None,
         of_page(
-            "Edit its views each alone too; on with a bundled editor.",
+            "Also edit each view of the page alone, for comparison (default: only with a bundled"
+            " editor).",
             None,
             "--control/--no-control",
         ),
     ] = None
     turntable: Annotated[
-        Path | None, of_page("Film of the scene's turn, before and after: .gif, .mp4.", "FILE")
+        Path | None,
+        of_page("Write a film of the scene's turn, before and after: .gif or .mp4.", "FILE"),
     ] = None
 
     def checked(self) -> EditOptions:
@@ -271,7 +347,7 @@ def program_options(
     version: Annotated[
         bool,
         option(
-            "Show the version and exit.", None, "--version", callback=_print_version, is_eager=True
+            "Show the version, and exit.", None, "--version", callback=_print_version, is_eager=True
         ),
     ] = False,
 ) -> None:

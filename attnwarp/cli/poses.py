@@ -20,11 +20,17 @@ LEAST = 3
 
 def poses(
     pictures: Annotated[Path, typer.Argument(help="Folder of photographs of one scene at rest.")],
-    out: Annotated[Path, option("Folder for the capture, which fit reads.", "CAPTURE")] = Path(
-        "capture"
-    ),
+    out: Annotated[
+        Path, option("Write the capture, which attnwarp fit reads, to this folder.", "CAPTURE")
+    ] = Path("capture"),
     each_camera: Annotated[
-        bool, option("Photographs differ in camera, zoom or size: a lens for each.")
+        bool,
+        option(
+            "Find a lens for each photograph, as they differ in camera, zoom or size (default: one"
+            " lens for all).",
+            None,
+            "--each-camera",
+        ),
     ] = False,
 ) -> None:
     """Find the pose and lens of each photograph by COLMAP, and undistort them for attnwarp fit.

@@ -26,26 +26,30 @@ from attnwarp.reporting import reporter
 
 @options_of(Reading, without="missing_images")
 def render(
-    model: Annotated[Path, typer.Argument(help="Splats: a PLY file.")],
+    model: Annotated[Path, typer.Argument(help="Splats to render: a .ply or .splat file.")],
     cameras: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder.")
+        Path, typer.Argument(help="Cameras: a transforms.json, its folder, or a COLMAP folder.")
     ],
-    out: Annotated[Path, option("Folder for the pictures.")],
+    out: Annotated[Path, option("Write the pictures to this folder.", "FOLDER")],
     background: Annotated[
-        str, option("black, white, or three numbers in [0, 1]: r,g,b.")
+        str, option("Draw before this colour: black, white, or r,g,b, each in [0, 1].", "COLOR")
     ] = "black",
     size: Annotated[
-        int | None, option("Longest side in px; the cameras' own if left out.", min=1)
+        int | None,
+        option("Render at this longest side in px (default: the cameras' own).", "N", min=1),
     ] = None,
     near: Annotated[
-        float | None, option("Nothing nearer is drawn, scene units; as in a fit if left out.")
+        float | None,
+        option(
+            "Draw nothing nearer than this depth in scene units (default: as in a fit).", "DEPTH"
+        ),
     ] = None,
     depth: Annotated[
-        bool, option("Also NAME.depth.npy: median depth, NaN where none.", None, "--depth")
+        bool, option("Also write NAME.depth.npy: median depth, NaN where none.", None, "--depth")
     ] = False,
     threads: ThreadsOption = None,
     normal: Annotated[
-        bool, option("Also NAME.normal.png: (n + 1) / 2 in world axes.", None, "--normal")
+        bool, option("Also write NAME.normal.png: (n + 1) / 2 in world axes.", None, "--normal")
     ] = False,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
