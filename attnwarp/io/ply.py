@@ -88,8 +88,7 @@ def read_ply(
     For the 2D kind a third scale is dropped.
 
     In Mip-Splatting's files ``filter_3D``, the standard deviation of each splat's smoothing filter,
-    is merged into scales and opacities (Yu et al. 2024, the 3D smoothing
-    filter).
+    is merged into scales and opacities (Yu et al. 2024, the 3D smoothing filter).
 
     Args:
         path: path of the file.

@@ -40,8 +40,7 @@ class WarpSettings(Settings):
         depth_agreement: True requires the point's depth in the source camera to equal the source's
             depth map.
         depth_relative, depth_slope: tolerance of depth agreement, ``depth_relative * z +
-            depth_slope *
-            slope``, the slope being the depth's change per pixel
+            depth_slope * slope``, the slope being the depth's change per pixel
             (:func:`attnwarp.warp.depth.depth_slope`).
         photometric: largest mean over channels of abs(warped source image - target image), sRGB in
             [0, 1], on the images before the edit; None disables the test.

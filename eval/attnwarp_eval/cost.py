@@ -46,8 +46,8 @@ class Meter:
     """Seconds and counters of one cell.
 
     The method's work is timed view by view: the first view pays for compilation and cold caches
-    ("warm"), the others give the steady figure. Everything else (truth, splats,
-    checks) is set-up and checking, and never part of a method's cost.
+    ("warm"), the others give the steady figure. Everything else (truth, splats, checks) is set-up
+    and checking, and never part of a method's cost.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """Things with named parts: people in garments, plants in pots, stumps with mushrooms, laid tables.
 
-Each part is a separate object with a surface, words and exact pixels. An edit
-changes one part, or all of them at once (a statue).
+Each part is a separate object with a surface, words and exact pixels. An edit changes one part, or
+all of them at once (a statue).
 """
 
 from __future__ import annotations

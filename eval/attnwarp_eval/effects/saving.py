@@ -53,9 +53,8 @@ class Cost:
     """Cost of everything on against the plan, measured on one small picture of the source.
 
     Everything on follows light until roulette ends it. If the scene caps its bounces, the plan
-    omits
-    that light and the two pictures have different means: then equal noise is not equal error, and
-    ``cap`` has the loss.
+    omits that light and the two pictures have different means: then equal noise is not equal error,
+    and ``cap`` has the loss.
 
     Attributes:
         size, spp: size in px and samples a pixel of the measurement.

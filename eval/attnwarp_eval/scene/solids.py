@@ -366,8 +366,7 @@ def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float)
     """The distance at every point of a lattice near its zero; farther off, the right sign.
 
     Blocks whose middle is farther from the surface than their radius, with half as much margin
-    since the distance is only a bound, take the middle's value: no triangle comes
-    from them.
+    since the distance is only a bound, take the middle's value: no triangle comes from them.
     """
     step = float(axes[0][1] - axes[0][0])
     volume = np.empty([len(axis) for axis in axes])

@@ -81,8 +81,7 @@ def compute_and_write(
     """Compute one cell and write its record; return its failure, or None.
 
     The cell is written where it is computed, so a lost connection loses no result. Every error
-    becomes a row of the table of failed cells: one bad cell must not cost the
-    others.
+    becomes a row of the table of failed cells: one bad cell must not cost the others.
     """
     try:
         Store(root).write(compute(probe, cell, Path(root), threads).to_json())

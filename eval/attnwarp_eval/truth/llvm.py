@@ -2,8 +2,8 @@
 elsewhere.
 
 ``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster
-(docs/truth/truth.md), but some LLVMs (14 and 15) abort the whole process
-instead of raising. So a child process tries it first.
+(docs/truth/truth.md), but some LLVMs (14 and 15) abort the whole process instead of raising. So a
+child process tries it first.
 """
 
 from __future__ import annotations

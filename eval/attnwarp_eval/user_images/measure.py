@@ -198,8 +198,8 @@ def measure(
 
     Args:
         encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
-            figures out. A missing kind, or None, takes the bundled one, and its
-            figures are left out if there is none.
+            figures out. A missing kind, or None, takes the bundled one, and its figures are left
+            out if there is none.
         store: cache of finished batches, so that an interrupted call is resumed. Views are
             identified by the content of their files.
         device: "cpu" or "cuda", for real encoders.

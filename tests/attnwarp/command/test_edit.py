@@ -301,7 +301,7 @@ def test_a_box_marks_what_opencv_cuts_out_and_a_click_its_surface(place, tmp_pat
     lit = read_image(tmp_path / "a" / "marked.png").astype(float)
     shown = 255 * source * np.where(mask, 1, 0.3)[..., None]
     drawn = (np.abs(lit - shown) > 1).any(-1)  # the box or the cross
-    assert 0 < drawn.mean() < 0.3 and drawn[:4].sum() < 60
+    assert 0 < drawn.mean() < 0.5 and drawn[:4].sum() < 60
     assert run(place, tmp_path / "b", *ply, "--mask", file).exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
