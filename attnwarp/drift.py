@@ -191,22 +191,23 @@ def drift_or_why(
     if found is None or found.agreeing < 2 * AGREEING:
         starts += _search(coarse[0])
         found = _best([found, *(_aligned(coarse, start, draw) for start in starts[1:])])
-    found = refined(found)
-    if similar := found is not None and found.agreeing >= AGREEING:
-        affine = _aligned(levels[-1:], np.r_[found.motion, 0, 0], draw)
+    fit = refined(found)
+    if fit is not None and fit.agreeing >= AGREEING:
+        affine = _aligned(levels[-1:], np.r_[fit.motion, 0, 0], draw)
     else:
-        tried = (_aligned(coarse, np.r_[start, 0, 0], draw) for start in starts)
-        found = affine = refined(_best(tried))
-        if affine is None or affine.agreeing < AGREEING:
+        fit = affine = refined(_best(_aligned(coarse, np.r_[s, 0, 0], draw) for s in starts))
+        if fit is None or fit.agreeing < AGREEING:
             return UNRELATED
-    if not found.resolved:
+    if not fit.resolved:
         return STRIPED
     if affine is not None and (stretch := affine.stretch()) is not None:
         away = float(np.sinh(stretch) * np.hypot(*size) / 2)
-        if away >= 0.5 or not similar:  # half of what the edges move by, so that 1 px is seen
+        if away >= 0.5 or fit is affine:  # half of what the edges move by, so that 1 px is seen
             return NoDrift("", 100 * float(np.expm1(2 * stretch)), away)
-    half = found.half_widths() if similar else None
-    return UNTEXTURED if half is None else _drift(found.motion, half, longest, size)
+    if fit is affine:
+        return UNRELATED
+    half = fit.half_widths()
+    return UNTEXTURED if half is None else _drift(fit.motion, half, longest, size)
 
 
 def _best(fits: Iterable[_Fit | None]) -> _Fit | None:
