@@ -181,7 +181,6 @@ def edit_dataset(
     compile_kernels(splats.kind, report, device)
     if line := say_without_surface(without_surface(splats, views)):
         report.log(line)
-        notes = [*notes, line]
     result = METHODS[method](
         splats,
         views.cameras,
@@ -208,7 +207,7 @@ def edit_dataset(
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views, turntable=options.turntable, report=report,
-        editor=editor if control else None, notes=notes(), origin=origin,
+        editor=editor if control else None, notes=[line, *notes()], origin=origin,
     )  # fmt: skip
     return result, page
 

@@ -1,5 +1,4 @@
-"""Bundled editors: small, trained from scratch by eval/training/, read from weights/.
-"""
+"""Bundled editors: small, trained from scratch by eval/training/, read from weights/."""
 
 from __future__ import annotations
 

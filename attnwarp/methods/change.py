@@ -55,11 +55,12 @@ def change_of(
                     inside &= resized(mask, size)[..., 0] > 0.5
             read = [
                 work.folder.read_picture(f"renders/{when}/{names[view]}.png").astype(np.float32)
+                / np.float32(255)
                 for when in ("before", "after")
             ]
             pictures = [
                 to_bytes(resized(work.views.picture(view), size)), after,
-                *(to_bytes(resized(picture / 255, size)) for picture in read),
+                *(to_bytes(resized(picture, size)) for picture in read),
             ]  # fmt: skip
             step = 1 + int(inside.sum()) // min(MOST_PIXELS, 1_000_000 // len(edited) + 1)
             yield names[view], [to_lab(picture[inside][::step]) for picture in pictures]
