@@ -66,7 +66,7 @@ def check_keys(study: Study, scenes: Mapping[str, Scene], cells: Sequence[Cell])
 
 
 def _keys_read(own: Probe[Any], study: Study, label: str, scenes: Mapping[str, Scene]) -> set[str]:
-    """Keys of a variant that a probe reads to list the variant's first cell."""
+    """Keys of a variant that a probe reads to list the variant's first cell; all without any."""
     read: set[str] = set()
     variant = study.variants[label].model_copy()
 
@@ -77,5 +77,5 @@ def _keys_read(own: Probe[Any], study: Study, label: str, scenes: Mapping[str, S
 
     variant.__class__ = Watched
     watched = study.model_copy(update={"variants": {**study.variants, label: variant}})
-    next(iter(own.cells(watched, [label], scenes)), None)
-    return read
+    first = next(iter(own.cells(watched, [label], scenes)), None)
+    return read if first is not None else variant.model_fields_set

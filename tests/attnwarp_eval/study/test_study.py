@@ -168,6 +168,11 @@ def test_a_key_that_no_probe_of_the_variant_reads_is_refused(tmp_path, probe, ow
     assert result.exit_code == 2
 
 
+def test_a_probe_without_a_cell_on_these_scenes_refuses_no_key(tmp_path):
+    # The bear alone has words for the probe `carry`, some of whose variants have options.
+    assert plan(load_study("quick", scenes=["spheres"]), Store(tmp_path / "run")).cells
+
+
 def test_variants_that_are_one_computation_are_named(tmp_path):
     path = write(tmp_path)
     shown = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
