@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache, lru_cache
 from typing import Any
 
@@ -16,7 +16,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene, scene_file
-from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.scene import Scene, orbit_camera
 from attnwarp_eval.splats.surface import SurfaceSamples, colored_samples, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
@@ -37,6 +37,7 @@ class World:
         content_hash: hash of the scene's file, as in a cell's spec.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.
         yaw: the same folded to [0, 180].
+        made: what a probe makes of the world for several cells, by a key of its own.
     """
 
     def __init__(self, scene: Scene, size: int) -> None:
@@ -51,6 +52,7 @@ class World:
             for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
         }
         self.yaw = {name: abs(yaw) for name, yaw in self.signed_yaw.items()}
+        self.made: dict[Hashable, Any] = {}
         # Cells of one scene use the same pairs; a world lives as long as its scene is in use.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         # Pairs of two targets are many, at 100 bytes a pixel each.
@@ -132,22 +134,10 @@ def _world(scene: str, size: int, content: bytes) -> World:
 
 
 def turned(scene: Scene, yaw: float) -> Camera:
-    """The source camera, turned about its look-at point by ``yaw`` degrees, level."""
-    spec = scene.spec.cameras
-    angle = np.radians(spec.source.yaw + yaw)
-    position = (
-        spec.look_at[0] + spec.radius * float(np.cos(angle)),
-        spec.look_at[1] + spec.radius * float(np.sin(angle)),
-        float(scene.source.position[2]),
-    )
-    return Camera.look_at(
-        position,
-        spec.look_at,
-        width=spec.size[0],
-        height=spec.size[1],
-        fov_y=spec.fov,
-        name=f"turned{yaw:g}",
-    )
+    """The source camera, ``yaw`` degrees further on its orbit; it looks where the source looks."""
+    orbit = scene.spec.cameras
+    further = {"yaw": orbit.source.yaw + yaw, "name": f"turned{yaw:g}"}
+    return orbit_camera(orbit, orbit.source.model_copy(update=further), 1)
 
 
 def changed(what: str) -> InputError:

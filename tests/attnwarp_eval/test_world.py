@@ -15,7 +15,7 @@ from attnwarp_eval.splats.export import orbit
 from attnwarp_eval.study.shared.edit_truth import neighbours
 from attnwarp_eval.truth import Geometry, appearance, two_view
 from attnwarp_eval.truth.mitsuba import build
-from attnwarp_eval.world import World, world
+from attnwarp_eval.world import World, turned, world
 
 
 def world_of(*yaws, source=0):
@@ -65,6 +65,23 @@ def test_a_camera_that_is_added_has_the_sign_of_its_side():
         assert world.yaw[camera.name] == pytest.approx(
             math.degrees(math.acos(x / math.hypot(x, y)))
         )
+
+
+def test_a_turned_source_keeps_its_own_radius_angle_and_point():
+    scene = load_scene("spheres")
+    around = scene.spec.cameras
+    own = around.source.model_copy(update={"radius": 2.0, "fov": 30.0, "look_at": (0.2, 0.1, 0.7)})
+    cameras = around.model_copy(update={"source": own})
+    scene = Scene(scene.spec.model_copy(update={"cameras": cameras}))
+    whole, third = turned(scene, 360), turned(scene, 120)
+    np.testing.assert_allclose(whole.position, scene.source.position, atol=1e-12)
+    np.testing.assert_allclose(whole.world_to_camera, scene.source.world_to_camera, atol=1e-12)
+    np.testing.assert_allclose(third.K, scene.source.K)
+    offset = (third.position - np.array(around.look_at))[:2]
+    angle = np.radians(own.yaw + 120)
+    np.testing.assert_allclose(offset, [2 * np.cos(angle), 2 * np.sin(angle)], atol=1e-12)
+    xy, _ = third.project(np.array(own.look_at))
+    np.testing.assert_allclose(xy, [third.width / 2, third.height / 2], atol=1e-6)
 
 
 def test_the_relation_of_any_two_views_is_that_of_their_cameras_and_goes_with_its_scene():

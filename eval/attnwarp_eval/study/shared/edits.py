@@ -187,6 +187,14 @@ def scene_seed(study: Study, scene: str, seed: int) -> int:
     return seed + SCENE_STEP * sample.index(scene) if scene in sample else seed
 
 
+def noise_seed(scene: Scene, seed: int) -> int:
+    """Seed of the noise of a drawn or named scene: the study's, offset by the scene's content.
+
+    :func:`scene_seed` has the reason; it leaves named scenes one seed.
+    """
+    return seed + SCENE_STEP * int(scene.content_hash[:5], 16)
+
+
 def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     """Settings of a variant's method: a preset, the study's fields, the variant's, and the
     fields of its warp. A dictionary changes the fields that it names.

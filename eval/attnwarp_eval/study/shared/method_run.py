@@ -58,18 +58,21 @@ def run_method(
     editor: Editor | None = None,
     donor: Donor | None = None,
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
+    words: Mapping[str, str] | None = None,
 ) -> EditedScene:
     """Edit a scene by the method of a cell; its seconds are added to the work's meter.
 
     Args:
-        work: work of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
+        work: work of the cell, whose spec has ``method``, ``settings`` and ``editor``.
         names: names of the views, the source first.
         editor: replacement of the spec's editor.
         donor: source of the control's features; by default the other scene's source with the same
             editor.
         segments: (H, W) bool of each view, the only pixels that may change.
+        words: ``instruction``, ``target`` and ``source``; by default the spec's entry ``edit``.
     """
     spec, world = work.spec, work.world
+    words = spec["edit"] if words is None else words
     with work.meter.stage("setup"):
         if editor is None:
             editor = load(work.cell.sources["editor"], spec["editor"])
@@ -84,8 +87,8 @@ def run_method(
             [world.camera(name) for name in names],
             [truth.originals[name] for name in names],
             editor,
-            spec["edit"]["target" if editor.guide == "depth" else "instruction"],
-            with_source_words(spec["settings"], spec["edit"]["source"]),
+            words["target" if editor.guide == "depth" else "instruction"],
+            with_source_words(spec["settings"], words["source"]),
             Path(folder),
             _warps(work, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from attnwarp_eval.study.shared.edits import (
     MethodProbe,
     VariantPart,
     editor_of,
+    noise_seed,
 )
 from attnwarp_eval.study.shared.method_run import other_world, own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
@@ -85,6 +85,7 @@ class IdealProbe(MethodProbe[IdealResult]):
     """One edit of a thing in parts by one method and the ideal editor."""
 
     name = "ideal"
+    protocol = 2
     study_part = EdgesPart
     whole = True
     metrics = metrics_of("parts.", "edit.drift")
@@ -118,7 +119,7 @@ class IdealProbe(MethodProbe[IdealResult]):
                 for seed in study.seeds:
                     spec = {
                         **self.common_spec(study, scene, seed),
-                        **self.variant_spec(study, study.variants[label], seed),
+                        **self.variant_spec(study, study.variants[label], noise_seed(scene, seed)),
                         **other,
                         "thing": thing,
                         **({"edges": True} if edges and label in edges.named else {}),
@@ -150,10 +151,11 @@ class IdealProbe(MethodProbe[IdealResult]):
             donor = self._donor(work, share)
         with meter.stage("splats"):
             before = splats_of(work)
-        # The words have no effect; the method requires some.
-        spec["edit"] = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
-        result = run_method(work, _truth(thing), names, before, editor=editor, donor=donor)
-        del spec["edit"]
+        # They have no effect; the method requires some.
+        words = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
+        result = run_method(
+            work, _truth(thing), names, before, editor=editor, donor=donor, words=words
+        )
         meter.add("whole", own_seconds(result))
         with meter.stage("checks"):
             edited: dict[str, Image] = {
@@ -228,7 +230,6 @@ class IdealProbe(MethodProbe[IdealResult]):
         return IdealResult.from_json(data["ideal"])
 
 
-@lru_cache(maxsize=3)
 def _thing(
     world: World,
     names: tuple[str, ...],
@@ -237,11 +238,15 @@ def _thing(
     colors: int,
     spp: int,
 ) -> Thing:
-    """The thing of a scene; the last ones are cached, since all variants share them."""
-    cameras = [world.camera(name) for name in names]
-    return Thing.of(
-        world.scene, world.geometry, cameras, objects, parts=parts, colors=colors, spp=spp
-    )
+    """The thing of a scene, which all variants share; kept as long as its world."""
+    key = ("thing", names, objects, parts, colors, spp)
+    if key not in world.made:
+        cameras = [world.camera(name) for name in names]
+        world.made[key] = Thing.of(
+            world.scene, world.geometry, cameras, objects, parts=parts, colors=colors, spp=spp
+        )
+    thing: Thing = world.made[key]
+    return thing
 
 
 def _truth(thing: Thing) -> EditTruth:

@@ -119,6 +119,14 @@ def test_features_of_another_scene_are_taken_and_true_pictures_are_refused(folde
         load(folder, variants=bound, probes={"carry": ["bound"]})
 
 
+def test_each_scene_has_noise_of_its_own(folder, monkeypatch):
+    painting(monkeypatch, RED)
+    edits = {"ball": "make the ball red", "spheres": "make it red"}
+    things = {**STUDY.get("things", {}), "spheres": ["melon"]}
+    both = cells(load(folder, carry={"edits": edits, "size": 32}, things=things))
+    assert len({cell.spec["settings"]["seed"] for cell in both}) == len(both) == 2
+
+
 def test_the_shipped_quick_study_edits_the_bear_alone():
     study = load_study("quick")
     assert {cell.scene for cell in cells(study)} == {"bear"}

@@ -110,6 +110,7 @@ def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
         ({"geometry": "truth"}, "'odd' renders nothing, so there is no time to take"),
         ({"mask": "truth"}, "'odd' takes its mask from the scene's truth"),
         ({"method": "by_view", "budget": {"network_rows": 4}}, "'odd' has a budget"),
+        ({"control": "another scene"}, "'odd' takes features of another scene"),
         ({"method": "true pictures"}, "'odd' edits nothing"),
     ],
 )

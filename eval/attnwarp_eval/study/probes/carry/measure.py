@@ -31,6 +31,7 @@ from attnwarp_eval.study.shared.edits import (
     MethodProbe,
     VariantPart,
     editor_of,
+    noise_seed,
 )
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
@@ -67,6 +68,7 @@ class CarryProbe(MethodProbe[NoExtra]):
     """One edit of a scene's thing by one method, in a few views."""
 
     name = "carry"
+    protocol = 2
     whole = True
     study_part = StudyPart
     metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
@@ -110,7 +112,7 @@ class CarryProbe(MethodProbe[NoExtra]):
                 for seed in study.seeds:
                     spec = {
                         **self.common_spec(study, scene, seed),
-                        **self.variant_spec(study, variant, seed),
+                        **self.variant_spec(study, variant, noise_seed(scene, seed)),
                         **donor,
                         "size": size,
                         "views": views,

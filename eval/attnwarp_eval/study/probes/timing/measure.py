@@ -21,6 +21,7 @@ from attnwarp_eval.study.probe import InTurn, Probe, Work, probe, register
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study, Whole
+from attnwarp_eval.study.shared.controls import OTHER_SCENE
 from attnwarp_eval.study.shared.edit_truth import planned_truth
 from attnwarp_eval.study.shared.edits import VariantPart, editor_of, edits_of, scene_seed
 from attnwarp_eval.study.shared.method_run import PARTS, WHOLE, run_method
@@ -83,6 +84,8 @@ class Timing(Probe[Rounds]):
                 continue
             why = "has a budget, which may cut it short" if own.budget is not None else ""
             why = "takes its mask from the scene's truth" if own.mask == "truth" else why
+            if own.control == OTHER_SCENE:
+                why = "takes features of another scene, whose edit is no part of its own"
             why = "edits nothing" if own.method == "true pictures" else why
             if why:
                 raise ValueError(
