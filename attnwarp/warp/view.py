@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import get_args
@@ -34,6 +35,10 @@ OVERSHOOT = 0.1
 """Largest accepted distance of a picture beyond [0, 1]: cubic resampling overshoots an edge by a
 tenth.
 """
+
+
+WORK: Counter[str] = Counter()
+"""Work of this process so far: ``view_pairs`` warped, splat-pixel ``pairs`` of their surfaces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +206,7 @@ def warp_surfaces(
         check.instance(source_surface, Surface, "source_surface", "Surface, such as Surface(depth)")
     _refuse_unread(settings, target_segment=target_segment)
     segment = None if target_segment is None else _checked_segment(target_segment, target)
+    WORK["view_pairs"] += 1
     parts = parts_of(target_surface, source_surface, segment)
     on = [rule for rule in RULES if rule.on(settings)]
     arguments = {rule.name: rule.arguments(settings, parts) for rule in on}
@@ -356,6 +362,7 @@ def render_surface(
     with torch.no_grad():
         plane = near_plane(gaussians, camera) if near is None else near
         seen = render(gaussians, camera, backend=backend, depth=how, near=plane)
+    WORK["pairs"] += seen.counters.get("pairs", 0)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
     if settings.undefined_depth == "farthest":
         undefined = z.isnan()

@@ -96,8 +96,8 @@ class Comparison:
         scenes: number of scenes of the most widely compared figure; hard cases do not count.
         rows: one for each (probe, variant, metric) on both sides.
         faults: failures without a figure.
-        added: figures that only the run has; they pass until ``--update`` adds them to the
-            baseline.
+        added: figures and counters that only the run has; they pass until ``--update`` adds them to
+            the baseline.
         unread: probes with cells on both sides and figures, none of which was compared.
         left_out: figures of one side only, which a comparison of common figures omits.
     """
@@ -172,6 +172,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
             faults.append(Fault("redefined", name, detail))
         if exact:
             faults += _counters(name, first[0].counters, second[0].counters)
+            new = sorted(second[0].counters.keys() - first[0].counters.keys())
+            added += [f"{name} / {counter}" for counter in new]
         first, second = left[key], right[key] = _without_psnr(first, second)
         missing, new = _missing_figures(name, first, second)
         faults += missing
@@ -286,11 +288,13 @@ def _plural(word: str, counted: Collection[object]) -> str:
 
 def _counters(name: str, first: Mapping[str, int], second: Mapping[str, int]) -> list[Fault]:
     faults = []
-    for counter in sorted(first.keys() | second.keys()):
-        before, now = first.get(counter), second.get(counter)
-        if before is None or now is None or not same_count(counter, before, now):
-            counts = ["none" if count is None else str(count) for count in (before, now)]
-            detail = f"{counts[0]} in the baseline, {counts[1]} in the run"
+    for counter, before in sorted(first.items()):
+        now = second.get(counter)
+        if now is None or not same_count(counter, before, now):
+            detail = f"{before} in the baseline, {'none' if now is None else now} in the run"
+            if now is not None and before:
+                word = "rose" if now > before else "fell"
+                detail += f": {word} by {100 * abs(now - before) / before:.3g} %"
             faults.append(Fault("counter", f"{name} / {counter}", detail))
     return faults
 

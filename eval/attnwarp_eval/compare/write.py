@@ -57,8 +57,12 @@ def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
     if comparison.too_little:
         lead.append(f"Too little to compare: {comparison.too_little}.")
     sections = []
-    if comparison.faults:
-        rows = [[fault.kind, fault.name, fault.detail] for fault in comparison.faults]
+    counters = [fault for fault in comparison.faults if fault.kind == "counter"]
+    if counters:
+        rows = [[fault.name, fault.detail] for fault in counters]
+        sections.append(_section("Counts of work that changed", ["count", "detail"], rows))
+    if others := [fault for fault in comparison.faults if fault.kind != "counter"]:
+        rows = [[fault.kind, fault.name, fault.detail] for fault in others]
         sections.append(_section("Missing or changed", ["what", "name", "detail"], rows))
     changed = sorted(
         (row for row in comparison.rows if row.verdict != "equal"),

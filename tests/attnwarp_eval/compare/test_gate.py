@@ -9,6 +9,7 @@ import pathlib
 import pytest
 from typer.testing import CliRunner
 
+from attnwarp.methods.attention_warping import AttentionWarping
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import compare, read_baseline, read_snapshot
 from attnwarp_eval.compare.pictures import pictures_of_baseline
@@ -103,6 +104,15 @@ def a_doubled_counter(patch):
     patch.setattr(Meter, "count", doubled)
 
 
+def a_repeated_edit(patch):
+    def twice(*arguments):
+        edit_targets(*arguments)
+        return edit_targets(*arguments)
+
+    edit_targets = AttentionWarping.edit_targets
+    patch.setattr(AttentionWarping, "edit_targets", twice)
+
+
 def a_dropped_cell(patch):
     def fails(self, work):
         if work.cell.variant == "released":
@@ -119,6 +129,7 @@ FOUND = {
     a_mask_rule_lost: ("worse", "warp / corrected / occlusion.precision"),
     a_dropped_metric: ("missing", "spheres / warp / corrected / seed 0 / warp.epe_median"),
     a_doubled_counter: ("counter", "spheres / warp / corrected / seed 0 / taps"),
+    a_repeated_edit: ("counter", "spheres / ideal / corrected / seed 0 / network_rows"),
     a_dropped_cell: ("missing", "spheres / warp / released / seed 0"),
 }
 

@@ -12,15 +12,21 @@ from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
 from attnwarp.methods import attention_warping, preset
+from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.compare import compare
+from attnwarp_eval.compare.snapshot import snapshot
+from attnwarp_eval.compare.write import document
 from attnwarp_eval.report.build import build
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
+from attnwarp_lab.ideal.editor import IdealTask
 from attnwarp_lab.ideal.figures import part_answers, part_figures
 from attnwarp_lab.ideal.share import Alone, alone, solve_share
 from attnwarp_lab.ideal.thing import Thing, in_front
@@ -67,7 +73,10 @@ def test_a_cell_has_the_figures_of_algorithm_1_with_the_ideal_editor(records):
     cameras = [of.camera(name) for name in names]
     thing = Thing.of(of.scene, of.geometry, cameras, THING, parts=8, colors=3, spp=1)
     share = solve_share(thing.grams, 0.4, 5)
-    settings = preset("attention_warping", stages=1, steps=5, iterations=0, noise="fresh", seed=0)
+    seed = records["full"].spec["settings"]["seed"]
+    settings = preset(
+        "attention_warping", stages=1, steps=5, iterations=0, noise="fresh", seed=seed
+    )
     model = splats("spheres", 64, 0, kind="2d", count=2000, position_noise=0.0, normal_noise=0.0)
     pictures = [thing.before[name] for name in names]
     result = attention_warping(
@@ -76,6 +85,10 @@ def test_a_cell_has_the_figures_of_algorithm_1_with_the_ideal_editor(records):
     edited = {names[k]: p.astype(np.float32) / np.float32(255) for k, p in result.edited.items()}
     answers = part_answers(edited["source"], thing.truth("source"), 8)
     record = records["full"]
+    counted = {
+        key: record.cost.counters[key] for key in ("network_rows", "view_pairs", "iterations")
+    }
+    assert counted == {"network_rows": 15, "view_pairs": 2, "iterations": 0}
     assert list(record.extra.answers) == answers.tolist() and record.extra.share == share
     assert (
         record.extra.fault is None
@@ -213,10 +226,58 @@ def test_another_scene_is_the_next_and_another_seed_is_the_methods(tmp_path):
             entry["scene"] == scenes[other].content_hash and "other" not in of[scene, "full"].spec
         )
         full, again = of[scene, "full"].spec, of[scene, "again"].spec
-        assert (
-            full["settings"]["seed"] == full["seed"] == again["seed"] != again["settings"]["seed"]
-        )
+        assert full["seed"] == again["seed"] == 0
+        assert full["settings"]["seed"] != again["settings"]["seed"]
         assert {**again, "settings": full["settings"]} == full
+    # Noise of its own for each scene, the same for all its variants.
+    seeds = {
+        scene: {of[scene, name].spec["settings"]["seed"] for name in ("full", "other")}
+        for scene in scenes
+    }
+    assert [len(own) for own in seeds.values()] == [1, 1] and seeds["spheres"] != seeds["bear"]
+
+
+def test_a_doubled_batch_of_the_network_fails_the_gate(tmp_path, monkeypatch):
+    """Oracle: rows by hand, three views of 5 steps each; the figures do not change."""
+    editing = {**STUDY["editing"], "options": {"steps": 5, "iterations": 0}}
+    variants = {"alone": {"method": "by_view"}}
+    study = load(tmp_path, editing=editing, variants=variants, probes={"ideal": ["alone"]})
+    (cell,) = cells(study)
+    records = [compute(probe("ideal"), cell, tmp_path)]
+    predict = IdealTask.predict
+
+    def twice(self, latents, timestep):
+        both = IdealTask(self.editor, [*self.views, *self.views])
+        return predict(both, latents.repeat(2, 1, 1, 1), timestep)[: len(latents)]
+
+    monkeypatch.setattr(IdealTask, "predict", twice)
+    records.append(compute(probe("ideal"), cell, tmp_path))
+    sides = [
+        snapshot(Results(study, [Outcome(cell.id, "", "spheres", ("alone",), "ideal", 0, r)], []))
+        for r in records
+    ]
+    assert sides[0].cells[0].counters["network_rows"] == 15
+    assert sides[0].cells[0].counters["view_pairs"] == 0
+    result = compare(*sides)
+    assert result.regressed and {row.verdict for row in result.rows} == {"equal"}
+    (fault,) = result.faults
+    assert fault.name == "spheres / ideal / alone / seed 0 / network_rows"
+    assert fault.detail == "15 in the baseline, 30 in the run: rose by 100 %"
+    (table,) = document(result).sections[0].tables
+    assert table.rows == [[fault.name, fault.detail]]
+
+
+def test_a_cells_spec_stays_its_address_where_the_method_fails(tmp_path, monkeypatch):
+    def fails(*_, **__):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(measure, "run_method", fails)
+    cell = cells(load(tmp_path))[0]
+    with pytest.raises(RuntimeError, match="no memory"):
+        compute(probe("ideal"), cell, tmp_path)
+    assert digest(cell.spec) == cell.id
+    # The thing lives as long as its world.
+    assert [key[0] for key in world("spheres", 64).made] == ["thing"]
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,8 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
+from attnwarp.warp.view import WORK
+from attnwarp_eval.cost import Meter
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
@@ -45,6 +48,9 @@ PARTS = (*EDITING_PARTS, "tune")
 WHOLE = "whole"
 """Stage of :class:`~attnwarp_eval.study.probe.InTurn`: all parts of an edit together."""
 
+ROWS = "network_rows"
+"""Counter of the rows of latents that pass through an editor's network."""
+
 FLOOR = "by_view"
 """Name of the method that edits each view alone."""
 
@@ -60,7 +66,7 @@ def run_method(
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
     words: Mapping[str, str] | None = None,
 ) -> EditedScene:
-    """Edit a scene by the method of a cell; its seconds are added to the work's meter.
+    """Edit a scene by the method of a cell; its seconds and its work are added to the work's meter.
 
     Args:
         work: work of the cell, whose spec has ``method``, ``settings`` and ``editor``.
@@ -96,10 +102,36 @@ def run_method(
             donor,
             segments,
         )
-        result = EDITING_METHODS[spec["method"]].run(job)
+        with _work_counted(work.meter, editor):
+            result = EDITING_METHODS[spec["method"]].run(job)
+    planned = {k: int(v) for k, v in result.counters.items() if k not in ("injected", ROWS)}
+    work.meter.count(**planned)
     for part, seconds in result.seconds.items():
         work.meter.add(f"method: {part}", seconds)
     return result
+
+
+@contextmanager
+def _work_counted(meter: Meter, editor: Editor) -> Iterator[None]:
+    """Count what a method does: rows that pass through the editor's network, pairs of views warped,
+    and splat-pixel pairs of the surfaces rendered for them.
+
+    The method's own figure of rows is its plan, which a fault in a pass does not change.
+    """
+    rows = 0
+
+    def note(_: Any, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        nonlocal rows
+        latents = next(a for a in (*arguments, *named.values()) if isinstance(a, torch.Tensor))
+        rows += len(latents)
+
+    before = WORK.copy()
+    hook = editor.network.register_forward_pre_hook(note, with_kwargs=True)
+    try:
+        yield
+    finally:
+        hook.remove()
+    meter.count(**{ROWS: rows}, **{k: WORK[k] - before[k] for k in ("view_pairs", "pairs")})
 
 
 def other_world(work: Work) -> World | None:

@@ -87,7 +87,7 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
                 )
             for grid in grids:
                 view.at((grid, grid))
-        meter.count(**view.target.counters)
+        meter.count(view_pairs=1, **view.target.counters)
         yield name, truth, view
 
 

@@ -179,7 +179,6 @@ class EditingProbe(MethodProbe[EditResult]):
         result = run_method(work, truth, names, before, budget)
         STOPWATCH.note(_decisive(spec), own_seconds(result))
         meter.add("whole", own_seconds(result))
-        meter.count(**{k: int(v) for k, v in result.counters.items() if k != "injected"})
         with meter.stage("checks"):
             extra = Measurement(work, truth, names, before, result, encoders).record()
         if budget is None:
