@@ -15,6 +15,7 @@ import tarfile
 import zipfile
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import trimesh
 
@@ -47,9 +48,10 @@ def of_module(module: str) -> bytes:
     return as_glb(trimesh.Trimesh(wanted["positions"], wanted["cells"], process=False))
 
 
-def as_glb(mesh: trimesh.Trimesh) -> bytes:
+def as_glb(mesh: Any) -> bytes:
     """A mesh without its materials as the bytes of a GLB."""
-    return bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="glb"))
+    data: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="glb")
+    return bytes(data)
 
 
 def meshes_of(package: Path) -> dict[str, bytes]:

@@ -42,20 +42,6 @@ def ball_scene(title, radius, colors, cameras, edits, *, objects=()):
     }
 
 
-def any_colour(name, instruction, source, target, colors):
-    """An edit that paints the ball in any of some colours, an answer each."""
-    return {
-        "name": name,
-        "instruction": instruction,
-        "source": source,
-        "target": target,
-        "answers": [
-            {"name": n, "target": f"a {n} ball", "changes": [{"object": "ball", "paint": value}]}
-            for n, value in colors.items()
-        ],
-    }
-
-
 COLORS = {"red": "#d03020", "green": "#209030", "blue": "#2040d0"}
 SCENE = ball_scene(
     "A ball on the ground",
@@ -63,13 +49,20 @@ SCENE = ball_scene(
     ("#c0c0c0", "#d0d0d0"),
     {"look_at": [0, 0, 0.8], "radius": 3.5, "targets": (15, 30, 120)},
     [
-        any_colour(
-            "some_colour",
-            "Paint the ball in some colour",
-            "a ball",
-            "a ball of some colour",
-            COLORS,
-        )
+        {
+            "name": "some_colour",
+            "instruction": "Paint the ball in some colour",
+            "source": "a ball",
+            "target": "a ball of some colour",
+            "answers": [
+                {
+                    "name": name,
+                    "target": f"a {name} ball",
+                    "changes": [{"object": "ball", "paint": value}],
+                }
+                for name, value in COLORS.items()
+            ],
+        }
     ],
 )
 """A ball that an ambiguous edit paints in one of :data:`COLORS`."""

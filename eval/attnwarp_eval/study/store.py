@@ -103,7 +103,7 @@ class Store:
         """Check that a run would overwrite only files of runs of its kind.
 
         Args:
-            kind: what the run is of, a key of :data:`KINDS`.
+            kind: subject of the run, a key of :data:`KINDS`.
 
         Raises:
             StoreError: the folder has files with a run's names and no study.json, or a run of

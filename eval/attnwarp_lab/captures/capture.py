@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from attnwarp.camera import Camera
 from attnwarp.cli.files import check_seen, likeness
@@ -91,12 +90,6 @@ def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) ->
             " coordinates and units (nerfstudio and gsplat turn, move and scale a scene first), or"
             " leave them out, so that they are fitted"
         )
-
-
-def splats_file(loaded: Loaded, run: Path, name: str, kind: Any) -> Path:
-    """File of a capture's splats: the manifest's, or the fit's in the run's folder."""
-    given = loaded.manifest.captures[name].splats.get(kind)
-    return loaded.path(given) if given else run / FITS / f"{name}-{kind}" / "splats.ply"
 
 
 def read_splats(path: Path, kind: str) -> Gaussians:

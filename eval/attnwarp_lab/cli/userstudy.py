@@ -67,7 +67,7 @@ def score(
     ],
     out: Annotated[Path | None, option("Folder for preferences.json, .md and .html.")] = None,
 ) -> None:
-    """How often people chose each method, with intervals, and who failed attention checks."""
+    """Selection frequency of each method, with intervals, and who failed attention checks."""
     import json
 
     from rich.console import Console
