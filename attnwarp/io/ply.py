@@ -106,8 +106,8 @@ def read_ply(
 
     Raises:
         FileNotFoundError: the file does not exist.
-        FileFormatError: the file is not a splat file, or a value is out of range; the message names
-            the property and the first bad row.
+        FileFormatError: the file is not a splat file, a property is missing, or a value is out of
+            range; the message names the argument of :class:`Gaussians` and the first bad row.
 
     Example:
         >>> from attnwarp.io import read_ply, write_ply
@@ -121,39 +121,15 @@ def read_ply(
         check.one_of(kind, ("2d", "3d"), "kind")
     columns, comments = _read_vertices(path)
     _refuse_other_formats(path, columns)
-    n = len(columns["x"]) if "x" in columns else 0
-    xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
-    opacity = _column(path, columns, "opacity", np.float64, infinities=True)
-    quats = _stack(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"), np.float32)
-    # In float32, like the model's check: there 1e-30 squared is zero and 1e30 squared infinite.
-    norm = torch.from_numpy(quats).norm(dim=-1).numpy()
-    _refuse(path, "rot_0..3", norm == 0, "a zero quaternion has no rotation", "remove the row")
-    _refuse(
-        path,
-        "rot_0..3",
-        ~np.isfinite(norm),
-        "the quaternion's length overflows float32",
-        "remove the row",
-    )
     header = _read_comments(path, comments)
+    xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
+    logits = _stack(path, columns, ("opacity",), np.float64)[:, 0]
     kind, names = _recognise(path, columns, header, kind)
-    scales = np.empty((n, len(names)), np.float32)
-    for i, name in enumerate(names):
-        log = _column(path, columns, name, np.float64)
-        with np.errstate(over="ignore", under="ignore"):
-            scales[:, i] = np.exp(log)
-        _refuse(
-            path,
-            name,
-            ~np.isfinite(scales[:, i]) | (scales[:, i] <= 0),
-            "scales are stored as natural logarithms, and e to this power does not fit float32",
-            "check that the writer stored logarithms",
-            log,
-        )
     with np.errstate(over="ignore"):
-        alpha = 1.0 / (1.0 + np.exp(-opacity))
+        scales = np.exp(_stack(path, columns, names, np.float64)).astype(np.float32)
+        alpha = 1.0 / (1.0 + np.exp(-logits))
     if FILTER_3D in columns and kind == "3d":
-        scales, share = _filtered(path, columns, scales)
+        scales, share = _filtered(columns[FILTER_3D], scales)
         alpha *= share
         if antialiased is None and not header.flags:
             antialiased = True
@@ -168,27 +144,25 @@ def read_ply(
         width = header.width(SCREEN_FILTER, screen_filter)
     if antialiased is None:
         antialiased = header.antialiased(path)
-    offset, means = split_origin(xyz)
-    if not np.isfinite(means).all():
-        _refuse(
-            path,
-            "x, y, z",
-            ~np.isfinite(means).all(axis=1),
-            "does not fit float32",
-            "remove the row",
+    try:
+        check.finite(xyz, "x, y, z")
+        offset, means = split_origin(xyz)
+        return Gaussians(
+            kind,
+            torch.from_numpy(means),
+            torch.from_numpy(_stack(path, columns, _names("rot", 4), np.float32)),
+            torch.from_numpy(scales),
+            torch.from_numpy(alpha.astype(np.float32)),
+            torch.from_numpy(_read_sh(path, columns)),
+            origin=header.origin + offset,
+            antialiased=antialiased,
+            screen_filter=width,
+            far=header.far,
         )
-    return Gaussians(
-        kind,
-        torch.from_numpy(means),
-        torch.from_numpy(quats),
-        torch.from_numpy(scales),
-        torch.from_numpy(alpha.astype(np.float32)),
-        torch.from_numpy(_read_sh(path, columns, n)),
-        origin=header.origin + offset,
-        antialiased=antialiased,
-        screen_filter=width,
-        far=header.far,
-    )
+    except FileFormatError:
+        raise
+    except ValueError as error:
+        raise FileFormatError(path, f"{error}; the file is damaged, or the fit diverged") from None
 
 
 def write_ply(
@@ -310,6 +284,10 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
     path = existing_file(path)
     columns, _ = _read_vertices(path)
     points = _stack(path, columns, ("x", "y", "z"), np.float64)
+    if not np.isfinite(points).all():
+        raise FileFormatError(
+            path, "not every point is finite; get the file again", field="x, y, z"
+        )
     names = next((triple for triple in COLORS if set(triple) & set(columns)), None)
     if names is None:
         return points, None
@@ -426,59 +404,30 @@ def _check_there(path: Path, columns: Columns, name: str) -> None:
         )
 
 
-def _column(
-    path: Path,
-    columns: Columns,
-    name: str,
-    dtype: type[np.floating[Any]],
-    *,
-    infinities: bool = False,
-) -> npt.NDArray[Any]:
-    """Read one property and check that it is finite in ``dtype``."""
-    _check_there(path, columns, name)
-    raw = columns[name]
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = raw.astype(dtype)
-    bad = np.isnan(values) if infinities else ~np.isfinite(values)
-    _refuse(
-        path, name, bad, "is not finite", "remove the row, or find out why the fit diverged", raw
-    )
-    return values
-
-
 def _stack(
     path: Path, columns: Columns, names: Sequence[str], dtype: type[np.floating[Any]]
 ) -> npt.NDArray[Any]:
-    return np.stack([_column(path, columns, name, dtype) for name in names], axis=1)
-
-
-def _refuse(
-    path: Path, name: str, bad: Any, what: str, remedy: str, values: npt.NDArray[Any] | None = None
-) -> None:
-    if bad.any():
-        row = int(np.argmax(bad))
-        value = "" if values is None else f"{values[row]!s} "
-        rows = f"{int(bad.sum())} of {len(bad)} rows, counted from 0"
-        raise FileFormatError(
-            path, f"{value}in row {row} ({rows}): {what}; {remedy}", field=name, row=row
-        )
+    """Stack properties as (N, names) of a type; values too large for it become infinite."""
+    for name in names:
+        _check_there(path, columns, name)
+    with np.errstate(over="ignore"):
+        return np.stack([columns[name].astype(dtype) for name in names], axis=1)
 
 
 def _filtered(
-    path: Path, columns: Columns, scales: npt.NDArray[np.float32]
+    width: npt.NDArray[Any], scales: npt.NDArray[np.float32]
 ) -> tuple[npt.NDArray[np.float32], Array]:
     """Merge the 3D filter: (N, 3) smoothed scales, and the (N,) remaining factor of opacities.
 
     The filter's covariance is added and the splat keeps its mass, so its peak falls by the square
     root of the ratio of determinants.
     """
-    width = _column(path, columns, FILTER_3D, np.float64)
     before = scales.astype(np.float64) ** 2
-    after = before + width[:, None] ** 2
+    after = before + width.astype(np.float64)[:, None] ** 2
     return np.sqrt(after).astype(np.float32), np.sqrt((before / after).prod(axis=1))
 
 
-def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
+def _read_sh(path: Path, columns: Columns) -> npt.NDArray[np.float32]:
     dc = _stack(path, columns, _names("f_dc", 3), np.float32)
     count = sum(name.startswith("f_rest_") for name in columns)
     if count not in (0, 9, 24, 45):
@@ -488,12 +437,11 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
             " 3, three channels); write the file again with one of these degrees",
             field="f_rest_*",
         )
-    sh = np.empty((n, 1 + count // 3, 3), np.float32)
-    sh[:, 0] = dc
-    if count:
-        rest = _stack(path, columns, _names("f_rest", count), np.float32)
-        sh[:, 1:] = rest.reshape(n, 3, count // 3).transpose(0, 2, 1)
-    return sh
+    if not count:
+        return dc[:, None]
+    rest = _stack(path, columns, _names("f_rest", count), np.float32)
+    rest = rest.reshape(len(dc), 3, count // 3).transpose(0, 2, 1)
+    return np.concatenate([dc[:, None], rest], axis=1)
 
 
 class _Header:
