@@ -21,7 +21,7 @@ from attnwarp.camera import Camera
 from attnwarp.render import Render
 
 Tensor = torch.Tensor
-Distortion = Literal["l1", "ordered", "l2_ndc"]
+Distortion = Literal["ordered", "l2_ndc"]
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
@@ -293,17 +293,17 @@ def normal_consistency(view: Render) -> Tensor:
     return torch.where(defined, view.alpha - agreement, 0.0).mean()
 
 
-def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.0) -> Tensor:
+def depth_distortion(view: Render, form: Distortion = "ordered", *, scale: float = 1.0) -> Tensor:
     """Average over pixels the depth spread of the splats along a ray.
 
     Args:
         view: rendered view.
-        form: "l1", sum_ij w_i w_j |z_i - z_j|, each pair twice (the 2DGS paper). "ordered", 2 sum_i
-            w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: cheaper, and less where splats
-            intersect. "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2, each pair once, with depths mapped
-            to [0, 1] (the original 2DGS code).
-        scale: length in scene units by which "l1" and "ordered" are divided, so that their weight
-            does not depend on the scene's unit.
+        form: "ordered", 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: sum_ij w_i
+            w_j |z_i - z_j| (the 2DGS paper), or less where splats intersect. "l2_ndc", sum_{j<i}
+            w_i w_j (m_i - m_j)^2, each pair once, with depths mapped to [0, 1] (the original 2DGS
+            code).
+        scale: length in scene units by which "ordered" is divided, so that its weight does not
+            depend on the scene's unit.
 
     Raises:
         ValueError: the form is unknown.
@@ -317,7 +317,7 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
     check.one_of(form, get_args(Distortion), "form")
     if form == "l2_ndc":
         return view.distortion_l2_ndc.mean()
-    return (view.distortion_l1 if form == "l1" else view.distortion_ordered).mean() / scale
+    return view.distortion_ordered.mean() / scale
 
 
 def _same(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:

@@ -95,7 +95,7 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
         camera = dataset.cameras[stems.index(path.stem)]
         view = render(splats, camera.resize(width, height), near=near)
         alpha = view.alpha.numpy()
-        forms = (view.distortion_l1, view.distortion_ordered, view.distortion_l2_ndc)
+        forms = (view.distortion_ordered, view.distortion_l2_ndc)
         views[path.stem] = {
             "psnr": -10 * float(np.log10(error)),
             "beyond": float((alpha < OPAQUE).mean()),

@@ -35,8 +35,8 @@ class FitSettings(Settings):
         ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
-        distortion_form: "l1" or "ordered" (in units of the scene's extent), or "l2_ndc"; see
-            :func:`attnwarp.losses.depth_distortion`. "l1" takes twice as long.
+        distortion_form: "ordered" (in units of the scene's extent) or "l2_ndc"; see
+            :func:`attnwarp.losses.depth_distortion`.
         normal_from, distortion_from: share of the iterations after which these losses begin (2DGS:
             7,000 and 3,000 of 30,000).
         background: colour behind the splats and behind transparent pixels of the images: "black",

@@ -65,4 +65,4 @@ def _call_all(kind: Kind, device: torch.device) -> None:
     )
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
     view = render(disc.to(device=device), camera)
-    (view.color.sum() + normal_consistency(view) + view.distortion_l1.sum()).backward()
+    (view.color.sum() + normal_consistency(view) + view.distortion_ordered.sum()).backward()

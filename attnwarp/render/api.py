@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -44,8 +44,8 @@ class Render:
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
             is at most alpha.
         distortion_ordered: (H, W) 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)| in compositing order:
-            ``distortion_l1`` where depth grows along that order, less elsewhere, and 0 only where
-            ``distortion_l1`` is 0. Scene units.
+            sum_ij w_i w_j |z_i - z_j| (the 2DGS paper) where depth grows along that order, less
+            elsewhere, and 0 only where that sum is 0. Scene units.
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: a splat's contribution to the picture; 0 means
@@ -86,19 +86,6 @@ class Render:
     depth_mode: str
     backend: str
     _pose: Tensor = field(repr=False)
-    _exact: Callable[[], Tensor] = field(repr=False)
-
-    @cached_property
-    def distortion_l1(self) -> Tensor:
-        """Sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper), (H, W), in scene units.
-
-        Every pair of splats counts twice, as in the paper's sum over i and j. Computed on first use
-        by a second pass over the splats; differentiable.
-
-        Raises:
-            RuntimeError: the splats were modified in place after rendering.
-        """
-        return self._exact()
 
     @cached_property
     def valid(self) -> Tensor:
@@ -292,7 +279,7 @@ def _result(
         )
     values = {name: getattr(outputs, name) for name in Outputs.__dataclass_fields__}
     return Render(
-        **{"_exact" if name == "exact" else name: value for name, value in values.items()},
+        **values,
         camera=used,
         depth_mode=inputs.depth,
         backend=backend,

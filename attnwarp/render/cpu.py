@@ -9,8 +9,6 @@
 4. Rasterization: composite tile by tile, square by square, until every pixel is opaque.
 5. Backward: the same tiles back to front, a row of gradients for each splat of a tile; each splat's
    rows are summed, and taken to the parameters and the pose.
-6. Exact distortion, on request: the same tiles front to back once more, in the backward
-   pass too.
 
 Threads follow ``torch.set_num_threads``; the result has the same bits for any number of threads.
 """
@@ -19,7 +17,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +25,6 @@ import torch
 from attnwarp.process import keep_freed_memory
 from attnwarp.render._kernels import (
     backward,
-    distortion,
     evaluation,
     layout,
     projection_backward,
@@ -43,16 +39,15 @@ from attnwarp.render.binned import (
     join,
 )
 from attnwarp.render.dispatch import call, typed
-from attnwarp.render.exact import outputs_of
-from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
+from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 # Fresh pages would cost a tenth of a picture's time.
 keep_freed_memory()
 
 MAP_READERS = {
-    "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "distortion_l1", "background"),
-    "depth": ("depth", "distortion_ordered", "distortion_l1"),
+    "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "background"),
+    "depth": ("depth", "distortion_ordered"),
 }
 """Outputs, and the background, whose gradients read a map held by the caller."""
 
@@ -98,42 +93,6 @@ def _workspace(channels: int) -> rasterization.Workspace:
         entries,
         np.empty(rasterization.BLOCK, np.int32),
     )
-
-
-def _pairs_workspace(room: int) -> distortion.Workspace:
-    return distortion.Workspace(
-        aligned(distortion.BUFFER_FLOATS),
-        aligned(distortion.WORK_FLOATS),
-        aligned_doubles(evaluation.MOMENTS),
-        np.empty(room * distortion.PAST, np.float32),
-        np.empty(room, np.int64),
-        np.empty(layout.SQUARES, np.int64),
-    )
-
-
-def _rooms(lists: layout.Lists) -> np.ndarray:
-    """Count the places needed by each tile's splats in ``distortion.Workspace``, (tiles,)."""
-    squares = distortion.bits(lists.entries >> layout.PLACE_BITS)
-    before = np.concatenate([[0], np.cumsum(squares)])
-    return before[lists.starts + lists.counts] - before[lists.starts]
-
-
-def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
-    """Compute ``distortion_l1``, (H, W), from a drawn picture with its state."""
-    binned, state = drawn.binned, drawn.pictures.state
-    target = np.empty(state.shape[1:], np.float32)
-    rooms = _rooms(binned.lists)[binned.tiles.order]
-    distort = typed(distortion.distort)
-
-    def work(first: int, last: int) -> None:
-        space = _pairs_workspace(int(rooms[first:last].max()))
-        distort(
-            first, last, binned.view, binned.tiles, binned.lists, binned.table, state, target,
-            space,
-        )  # fmt: skip
-
-    run_jobs(work, binned.pieces(binned.lists.counts))
-    return torch.from_numpy(target)
 
 
 def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
@@ -225,8 +184,7 @@ class _Composite(torch.autograd.Function):
         # Not saved, as most gradients read neither. Detached, they hold no graph, but they share
         # the caller's memory and its version counter.
         ctx.maps = {"alpha": alpha.detach(), "depth": depth.detach()}
-        placeholder = torch.zeros(1, dtype=torch.float32).expand(inputs.height, inputs.width)
-        return *outputs, placeholder, torch.from_numpy(drawn.weight)
+        return *outputs, torch.from_numpy(drawn.weight)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -236,9 +194,7 @@ class _Composite(torch.autograd.Function):
         if ctx.needs_input_grad[8] and "color" in wanted:
             wanted.add("background")
         drawn = _with_sound_maps(ctx.drawn, ctx.maps, wanted)
-        height, width = drawn.pictures.alpha.shape
-        exact = (height if "distortion_l1" in wanted else 0, width)
-        shapes = [*(picture.shape for picture in drawn.pictures[:-1]), exact, drawn.weight.shape]
+        shapes = [*(picture.shape for picture in drawn.pictures[:-1]), drawn.weight.shape]
         given = layout.Upstream(
             *(
                 np.zeros(shape, np.float32) if grad is None else as_array(grad, np.float32)
@@ -327,8 +283,6 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
     columns = layout.GRADIENTS + 3 + max(3, binned.channels)
     total = np.zeros((n, columns), np.float64)
     order, counts = binned.tiles.order, binned.lists.counts
-    exact = len(upstream.exact) > 0
-    rooms = _rooms(binned.lists)[order] if exact else np.zeros(tile_count, np.int64)
     before = np.concatenate([[0], np.cumsum(counts[order])])
     buffer = np.empty((0, columns), np.float32)
     first, rasterize_backward = 0, typed(backward.rasterize_backward)
@@ -352,7 +306,6 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
                 aligned(backward.buffer_floats(binned.channels)),
                 aligned(backward.WORK_FLOATS),
                 aligned_doubles(evaluation.MOMENTS),
-                _pairs_workspace(int(rooms[begin:end].max())),
             )
             rasterize_backward(
                 begin, end, binned.view, binned.tiles, binned.lists, binned.table,
@@ -376,12 +329,6 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
 def render(inputs: Inputs) -> Outputs:
     """Render on the CPU; see :func:`attnwarp.render.render`."""
     kept: list[_Drawn] = []
-    tensors = _Composite.apply(inputs, kept, *inputs.leaves)
-    (drawn,) = kept
-    return outputs_of(
-        inputs,
-        tensors,
-        drawn.counters,
-        partial(_exact_distortion, drawn),
-        lambda: _exact_distortion(_draw(inputs, with_state=True)),
-    )
+    *pictures, weight = _Composite.apply(inputs, kept, *inputs.leaves)
+    named = dict(zip(PICTURES, pictures, strict=True))
+    return Outputs(**named, weight=weight, counters=kept[0].counters)

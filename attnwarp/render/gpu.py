@@ -9,11 +9,9 @@ reference.
 4. Compositing, one thread a pixel, until the 32 pixels of a warp are opaque.
 5. Backward: each pixel's splats back to front. A splat's gradients are summed over a warp's
    pixels, then added to its row in float64, and taken to the parameters and the pose.
-6. Exact distortion, on request: the splats of each pixel are kept, so that each can walk back
-   over splats out of order.
 
-The host waits for the device once per picture, for the number of entries and of ties; once more for
-the exact distortion, and if the pose has a gradient. Pictures and weights have the same bits in
+The host waits for the device once per picture, for the number of entries and of ties; once more
+if the pose has a gradient. Pictures and weights have the same bits in
 every run, gradients up to the order of sums in float64: 1e-15 of the largest term.
 
 Kernels run on the splats' device. For CPU tensors that is Warp's CPU device, on one thread: far
@@ -35,7 +33,6 @@ import torch
 
 from attnwarp.errors import optional_imports
 from attnwarp.process import kernel_folders
-from attnwarp.render.exact import outputs_of
 from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
 
 with optional_imports():
@@ -269,7 +266,7 @@ def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
     color, normal = torch.empty(h, w, inputs.channels, **single), torch.empty(h, w, 3, **single)
     alpha, depth, median, ordered, l2 = (torch.empty(h, w, **single) for _ in range(5))
     pictures = (color, alpha, depth, median, normal, ordered, l2)
-    state, steps = torch.empty(3, h, w, **single), torch.empty(3, h, w, **whole)
+    state, steps = torch.empty(3, h, w, **single), torch.empty(2, h, w, **whole)
     background = inputs.background.detach().float().contiguous()
     features = splats.values[:0] if inputs.harmonic else splats.values
     sums = torch.zeros(n, dtype=torch.int64, device=device)
@@ -284,27 +281,6 @@ def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
         counters,
     )  # fmt: skip
     return drawn, pictures, weight
-
-
-def _pair_up(drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute ``distortion_l1``, (H, W), the rows of ``past``, and each pixel's last row."""
-    hits = drawn.steps[compositing.Plane.hits]
-    ends = torch.cumsum(hits.flatten(), 0, dtype=torch.int64).reshape(hits.shape)
-    total = int(ends[-1, -1])
-    if total > MOST_ENTRIES:
-        raise RuntimeError(
-            f"distortion_l1: {total} pairs of a splat and a pixel, more than {MOST_ENTRIES}; use"
-            " distortion_ordered, or a smaller picture"
-        )
-    past = torch.empty(total, 5, dtype=torch.float32, device=drawn.device)
-    target = torch.empty(hits.shape, dtype=torch.float32, device=drawn.device)
-    with _on(drawn.device):
-        _launch(
-            compositing.pair_up, drawn.threads, drawn.device,
-            drawn.view, drawn.singles, drawn.terms, drawn.entries, drawn.bounds, drawn.steps, ends,
-            past, target,
-        )  # fmt: skip
-    return target, past, ends
 
 
 class _Composite(torch.autograd.Function):
@@ -327,10 +303,7 @@ class _Composite(torch.autograd.Function):
             # Copies of two outputs read by the backward pass: the caller may change the originals.
             made = dict(zip(PICTURES, pictures, strict=True))
             ctx.drawn, ctx.maps = drawn, {name: made[name].clone() for name in ("alpha", "depth")}
-        placeholder = torch.zeros(1, dtype=torch.float32, device=drawn.device).expand(
-            inputs.height, inputs.width
-        )
-        return *pictures, placeholder, weight
+        return *pictures, weight
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -359,19 +332,14 @@ def _gradients(
         else grad.float().contiguous()
         for name, grad in upstream.items()
     }
-    past = torch.empty(0, 5, dtype=torch.float32, device=device)
-    ends = torch.zeros(1, 1, dtype=torch.int64, device=device)
-    if upstream["distortion_l1"] is not None:
-        _, past, ends = _pair_up(drawn)
     extra = max(0, channels - 3)
     total = torch.zeros(n, COLUMNS + extra, dtype=PRECISE, device=device)
     _launch(
         backward.composite_backward, drawn.threads, device,
         view, drawn.singles, drawn.features, drawn.terms, drawn.entries, drawn.bounds,
-        drawn.background, maps["alpha"], maps["depth"], drawn.state, drawn.steps, ends, past,
+        drawn.background, maps["alpha"], maps["depth"], drawn.state, drawn.steps,
         given["color"], given["alpha"], given["depth"], given["median_depth"], given["normal"],
-        given["distortion_ordered"], given["distortion_l2_ndc"], given["distortion_l1"],
-        given["weight"], total,
+        given["distortion_ordered"], given["distortion_l2_ndc"], given["weight"], total,
     )  # fmt: skip
     made = [torch.zeros_like(part) for part in splats.parts]
     with_pose = bool(ctx.needs_input_grad[7])
@@ -401,12 +369,6 @@ def _gradients(
 def render(inputs: Inputs) -> Outputs:
     """Render on the splats' device; see :func:`attnwarp.render.render`."""
     kept: list[_Drawn] = []
-    tensors = _Composite.apply(inputs, kept, *inputs.leaves)
-    (drawn,) = kept
-    return outputs_of(
-        inputs,
-        tensors,
-        drawn.counters,
-        lambda: _pair_up(drawn)[0],
-        lambda: _pair_up(_draw(inputs)[0])[0],
-    )
+    *pictures, weight = _Composite.apply(inputs, kept, *inputs.leaves)
+    named = dict(zip(PICTURES, pictures, strict=True))
+    return Outputs(**named, weight=weight, counters=kept[0].counters)

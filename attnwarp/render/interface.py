@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -61,12 +60,6 @@ class Outputs:
     distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int]
-    exact: Callable[[], Tensor]  # computes distortion_l1
-
-    @property
-    def distortion_l1(self) -> Tensor:
-        """Exact distortion, (H, W), computed at each use."""
-        return self.exact()
 
 
 PICTURES = (
@@ -78,7 +71,7 @@ PICTURES = (
     "distortion_ordered",
     "distortion_l2_ndc",
 )
-"""Names of the picture outputs of the first pass."""
+"""Names of the picture outputs."""
 
-OUTPUTS = (*PICTURES, "distortion_l1", "weight")
+OUTPUTS = (*PICTURES, "weight")
 """Names of the differentiable outputs."""

@@ -54,16 +54,32 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
-def render(
-    inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int = 1 << 22
-) -> Outputs:
+CHUNK = 1 << 22
+"""Splat-pixel pairs held at once."""
+
+
+def render(inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int = CHUNK) -> Outputs:
     """Render by brute force in float64; differentiable in every tensor of ``inputs``.
 
     Args:
         chunk: number of splat-pixel pairs held at once; rows of pixels are processed in groups of
             about this size.
     """
-    limits = thresholds or Thresholds()
+    return _render(inputs, thresholds or Thresholds(), chunk)[0]
+
+
+def distortion_l1(inputs: Inputs, *, chunk: int = CHUNK) -> Tensor:
+    """Compute sum_ij w_i w_j |z_i - z_j| at each pixel, (H, W), the loss of the 2DGS paper, in
+    which every pair counts twice; differentiable.
+
+    It takes each pixel's splats sorted by depth. ``distortion_ordered`` of a render equals it
+    where the order of compositing is that of depth.
+    """
+    return _render(inputs, Thresholds(), chunk)[1]
+
+
+def _render(inputs: Inputs, limits: Thresholds, chunk: int) -> tuple[Outputs, Tensor]:
+    """Render; also the paper's distortion."""
     means, quats, scales = inputs.means.double(), inputs.quats.double(), inputs.scales.double()
     opacities, values, background = (
         inputs.opacities.double(),
@@ -130,7 +146,7 @@ def render(
         "pairs": len(means) * inputs.width * inputs.height,
         "contributing": sum(int(part[9]) for part in parts),
     }
-    return Outputs(color, alpha, depth, median, normal, ordered, l2, weight, counters, l1.clone)
+    return Outputs(color, alpha, depth, median, normal, ordered, l2, weight, counters), l1
 
 
 @dataclass(frozen=True)

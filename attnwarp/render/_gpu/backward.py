@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from attnwarp.render import constants
-from attnwarp.render._gpu.compositing import Past, Plane, pixel_of
+from attnwarp.render._gpu.compositing import Plane, pixel_of
 from attnwarp.render._gpu.evaluation import ALPHA_MAX, depth_from, evaluate
 from attnwarp.render._gpu.lanes import (
     COLUMNS,
@@ -39,8 +39,6 @@ def composite_backward(
     depth: wp.array2d(dtype=wp.float32),
     state: wp.array3d(dtype=wp.float32),
     steps: wp.array3d(dtype=wp.int32),
-    ends: wp.array2d(dtype=wp.int64),  # end of each pixel's rows of past
-    past: wp.array2d(dtype=wp.float32),  # see pair_up; no rows without d_exact
     d_color: wp.array3d(dtype=wp.float32),
     d_alpha: wp.array2d(dtype=wp.float32),
     d_depth: wp.array2d(dtype=wp.float32),
@@ -48,7 +46,6 @@ def composite_backward(
     d_normal: wp.array3d(dtype=wp.float32),
     d_ordered: wp.array2d(dtype=wp.float32),
     d_l2: wp.array2d(dtype=wp.float32),
-    d_exact: wp.array2d(dtype=wp.float32),
     d_weight: wp.array(dtype=wp.float32),
     total: wp.array2d(dtype=wp.float64),
 ):
@@ -59,11 +56,10 @@ def composite_backward(
     """
     here = pixel_of(view, wp.tid())
     row, column = here.row, here.column
-    exact = past.shape[0] > 0
-    last, median_step, at = wp.int32(0), wp.int32(0), wp.int32(0)
+    last, median_step = wp.int32(0), wp.int32(0)
     T, A, mean, mean_inverse = f32(1.0), f32(1.0), f32(0.0), f32(0.0)
     in_depth, in_l2, in_median = f32(0.0), f32(0.0), f32(0.0)
-    in_ordered, in_exact = f32(0.0), f32(0.0)
+    in_ordered = f32(0.0)
     in_normal, in_color = wp.vec3f(), wp.vec3f()
     behind_alpha, behind_depth = f32(0.0), f32(0.0)
     # Each splat's part with the sign of its gap.
@@ -91,9 +87,6 @@ def composite_backward(
             in_normal[k] = d_normal[row, column, k]
         behind_loss = -in_alpha * T
         in_ordered = f32(2.0) * d_ordered[row, column]
-        if exact:
-            in_exact = f32(2.0) * d_exact[row, column]
-            at = wp.int32(ends[row, column])
         in_median = d_median[row, column]
     begin = bounds[here.tile, 0]
     most = most_of_lanes(last)
@@ -130,13 +123,6 @@ def composite_backward(
                     sign = wp.sign(gap)
                 g += in_ordered * (sign * gap + signed_depth - z[0] * signed_alpha)
                 in_z = w * (in_depth + in_ordered * (sign * front - signed_alpha))
-                if exact:
-                    at -= 1
-                    spread, lean = past[at, Past.spread], past[at, Past.lean]
-                    g += in_exact * (
-                        gap + behind_depth - z[0] * behind_alpha + f32(2.0) * spread
-                    )  # fmt: skip
-                    in_z += w * in_exact * (front - behind_alpha + f32(2.0) * lean)
                 if step == median_step:
                     in_z += in_median
                 # Chain rule through 1 / z: d(1 / z) / dz = -1 / z^2.

@@ -1,7 +1,5 @@
 # mypy: ignore-errors
-"""Compositing, one thread a pixel: the pictures front to back, and the pairs out of order that the
-exact distortion needs.
-"""
+"""Compositing, one thread a pixel: the pictures front to back."""
 
 from __future__ import annotations
 
@@ -30,21 +28,6 @@ class Plane:
     # int32
     last = 0  # 1 + place in the tile's list of the last splat drawn; 0: none
     median = 1
-    hits = 2  # splats drawn
-
-
-class Past:
-    """Columns of a splat drawn at a pixel; see :func:`pair_up`.
-
-    ``lean`` and ``spread`` are half the changes made by pairs out of order in
-    sum_j w_j sign(z_i - z_j) and in sum_j w_j |z_i - z_j|.
-    """
-
-    weight = 0
-    depth = 1
-    deepest = 2  # the largest depth so far
-    lean = 3
-    spread = 4
 
 
 @wp.struct
@@ -167,68 +150,3 @@ def composite(
     state[Plane.variance, here.row, here.column] = variance
     steps[Plane.last, here.row, here.column] = last
     steps[Plane.median, here.row, here.column] = median_step
-    steps[Plane.hits, here.row, here.column] = hits
-
-
-@wp.kernel(enable_backward=False)
-def pair_up(
-    view: View,
-    singles: wp.array2d(dtype=wp.float32),
-    terms: wp.array2d(dtype=wp.float32),
-    splats: wp.array(dtype=wp.int32),
-    bounds: wp.array2d(dtype=wp.int32),
-    steps: wp.array3d(dtype=wp.int32),
-    ends: wp.array2d(dtype=wp.int64),  # of each pixel's rows of past
-    past: wp.array2d(dtype=wp.float32),
-    target: wp.array2d(dtype=wp.float32),
-):
-    """Write the exact distortion of a pixel, and the changes by its pairs out of order.
-
-    In compositing order the sum of w_i w_j (z_i - z_j) takes two running sums, but a pair out of
-    order counts with the wrong sign. So every splat walks back over the splats in front of it,
-    until the largest depth among them no longer exceeds its depth.
-    """
-    here = pixel_of(view, wp.tid())
-    if not here.inside:
-        return
-    T, A, depth_sum, pairs = f32(1.0), f32(0.0), f32(0.0), f32(0.0)
-    first_depth, deepest = f32(0.0), f32(-1e30)
-    begin, last = bounds[here.tile, 0], steps[Plane.last, here.row, here.column]
-    hits = steps[Plane.hits, here.row, here.column]
-    start = wp.int32(ends[here.row, here.column]) - hits
-    at = start
-    for e in range(begin, begin + last):
-        i = splats[e]
-        r = evaluate(view, singles, terms, i, e, here.x, here.y)
-        if r.drawn:
-            w = r.alpha * T
-            if at == start:
-                z = depth_from(view, singles, i, r, f32(0.0), f32(0.0))
-                first_depth = z[0]
-            z = depth_from(view, singles, i, r, first_depth, f32(0.0))
-            lean, spread = f32(0.0), f32(0.0)
-            k = at - 1
-            while k >= start:
-                if past[k, Past.deepest] <= z[0]:
-                    break
-                gap = past[k, Past.depth] - z[0]
-                if gap > f32(0.0):
-                    w_k = past[k, Past.weight]
-                    lean -= w_k
-                    spread += w_k * gap
-                    past[k, Past.lean] = past[k, Past.lean] + w
-                    past[k, Past.spread] = past[k, Past.spread] + w * gap
-                k -= 1
-            deepest = wp.max(deepest, z[0])
-            past[at, Past.weight] = w
-            past[at, Past.depth] = z[0]
-            past[at, Past.deepest] = deepest
-            past[at, Past.lean] = lean
-            past[at, Past.spread] = spread
-            at += 1
-            pairs += (w * z[0] * A - w * depth_sum) + f32(2.0) * w * spread
-            T -= w
-            A += w
-            depth_sum += w * z[0]
-    # Clamped to 0: running sums of equal depths leave a rounding error.
-    target[here.row, here.column] = f32(2.0) * wp.max(pairs, f32(0.0))

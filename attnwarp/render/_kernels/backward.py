@@ -11,9 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from attnwarp.render._kernels import distortion
 from attnwarp.render._kernels.compilation import bare, f32, f64, inlined, jit, prefetch, u64
-from attnwarp.render._kernels.distortion import PAST, PAST_AT, count_bits, pair_up, prepare
 from attnwarp.render._kernels.evaluation import (
     depth_from,
     evaluate,
@@ -87,12 +85,11 @@ class Slots(NamedTuple):
     # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
     # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
     behind_loss: int = 15
-    d_exact: int = 16
     # Each splat's part with the sign of its gap; see _blame.
-    signed_alpha: int = 17
-    signed_depth: int = 18
-    d_normal: int = 19  # (3)
-    d_color: int = 22  # (channels)
+    signed_alpha: int = 16
+    signed_depth: int = 17
+    d_normal: int = 18  # (3)
+    d_color: int = 21  # (channels)
 
 
 SLOT = Slots()
@@ -121,7 +118,6 @@ class Workspace(NamedTuple):
     buffer: np.ndarray  # (buffer_floats,) float32, see Slots
     splat: np.ndarray  # (WORK_FLOATS,) float32, see WorkRegions
     moments: np.ndarray  # (MOMENTS,) float64; see lay_out
-    pairs: distortion.Workspace
 
 
 class DiscSums(NamedTuple):
@@ -224,8 +220,6 @@ def _select_drawn(buffer, p, background, scale):
     slot = SLOT.d_depth * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
-    slot = SLOT.d_exact * PIXELS + p
-    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
     slot = SLOT.d_ordered * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
     slot = SLOT.d_median * PIXELS + p
@@ -255,8 +249,6 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, pixel)
         copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, pixel)
         copy4(buffer, SLOT.d_ordered * PIXELS + p, upstream.ordered, pixel)
-        if upstream.exact.shape[0] > 0:
-            copy4(buffer, SLOT.d_exact * PIXELS + p, upstream.exact, pixel)
         copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, pixel)
         separate4(buffer, SLOT.d_normal * PIXELS + p, PIXELS, upstream.normal, 3 * pixel)
         separate4(buffer, SLOT.d_color * PIXELS + p, PIXELS, upstream.color, 3 * pixel)
@@ -291,21 +283,14 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
             buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
             buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
-            if upstream.exact.shape[0] > 0:
-                buffer[u64(SLOT.d_exact * PIXELS) + p] = f32(2.0) * upstream.exact[y, x]
             buffer[u64(SLOT.d_ordered * PIXELS) + p] = f32(2.0) * upstream.ordered[y, x]
             buffer[u64(SLOT.d_median * PIXELS) + p] = upstream.median[y, x]
             buffer[u64(SLOT.alpha * PIXELS) + p] = A
 
 
 @inlined
-def _blame(
-    space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out, place
-):
+def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out):
     """Compute gradients of a splat's 16 pixels in its alpha and z; update the sums behind it.
-
-    Args:
-        place: start of the splat's pairs out of order in ``space.pairs.past``; negative: unused.
 
     Returns:
         The splat's weights; alpha times the gradient in alpha; the gradient in z.
@@ -347,12 +332,6 @@ def _blame(
     sign = select(z * f32(GAP_MIN) < gap, one, select(gap < z * f32(-GAP_MIN), -one, zero))
     g = g + d_ordered * (sign * gap + signed_depth - dz * signed_alpha)
     in_z = w * (d_depth + d_ordered * (sign * front - signed_alpha))
-    if place >= 0:
-        d_exact, past = load(buffer, SLOT.d_exact * PIXELS + s), space.pairs.past
-        spread = two * load(past, place + PAST_AT.spread)
-        lean = two * load(past, place + PAST_AT.lean)
-        g = g + d_exact * (gap + behind_depth - dz * behind_alpha + spread)
-        in_z = in_z + w * d_exact * (front - behind_alpha + lean)
     is_median = step == load(buffer, SLOT.median_step * PIXELS + s)
     in_z = in_z + select(is_median, load(buffer, SLOT.d_median * PIXELS + s), zero)
     # Chain rule through 1/z: d(1/z)/dz = -1/z^2.
@@ -468,11 +447,9 @@ def _add_ellipsoid(work, nx, ny, in_alpha, in_z, by_center, sums):
 
 
 @inlined
-def _splat_backward(
-    space, table, view, tile, k, step, squares, d_weight, channels, rows, line, place
-):
-    """Compute the row of gradients of table row k in a tile, from the squares the splat may cover;
-    ``place`` as in :func:`_blame`, of the first square."""
+def _splat_backward(space, table, view, tile, k, step, squares, d_weight, channels, rows, line):
+    """Compute the row of gradients of table row k in a tile, from the squares the splat may
+    cover."""
     buffer, work, moments = space.buffer, space.splat, space.moments
     discs, by_center = view.discs, view.by_center
     zero = load(buffer, SLOT.x * PIXELS) * f32(0.0)
@@ -506,15 +483,12 @@ def _splat_backward(
         )
         z, inverse_z = depth_from(work, WORK.row, scaled, inverse, discs, by_center, zero, zero)
         hit = inside & (step <= load(buffer, SLOT.last_step * PIXELS + s))
-        pairs = place
-        if place >= 0:
-            place += PAST
         if not any_true(hit):
             continue
         hits += 1
         w, in_alpha, in_z = _blame(
             space, s, WORK.row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
-            table.features, rows[line], pairs,
+            table.features, rows[line],
         )  # fmt: skip
         f0, f1, f2, f3, f4, f5 = _add_features(buffer, s, w, (f0, f1, f2, f3, f4, f5))
         sums = (b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14, b15, b16)
@@ -573,9 +547,6 @@ def rasterize_backward(
         buffer[SLOT.x * PIXELS + p] = f32(p // 16 % SIDE * 4 + p % 4) - f32(TILE / 2 - 0.5)
         buffer[SLOT.y * PIXELS + p] = f32(p // (16 * SIDE) * 4 + p // 4 % 4) - f32(TILE / 2 - 0.5)
     prepare_moments(space.moments, 0)
-    exact = upstream.exact.shape[0] > 0
-    if exact:
-        prepare(space.pairs)
     for visited in range(first, last):
         t = tiles.order[visited]
         begin, count = lists.starts[t], lists.counts[t]
@@ -588,11 +559,6 @@ def rasterize_backward(
             _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream)
         else:
             _load_tile(buffer, tile, background, scale, pictures, upstream)
-        places = 0
-        if exact:
-            places = pair_up(
-                space.pairs, table, view, tile, entries, begin, count, pictures.state, True
-            )
         for back in range(count):
             e = begin + count - 1 - back
             entry = entries[e]
@@ -601,10 +567,9 @@ def rasterize_backward(
             if squares != 0:
                 k, step = entry & PLACE, f32(e - begin + 1)
                 line = target.starts[t] + count - 1 - back
-                places -= count_bits(squares)
                 _splat_backward(
                     space, table, view, tile, k, step, squares, upstream.weight[k], channels,
-                    target.rows, line, places * PAST if exact else -1,
+                    target.rows, line,
                 )  # fmt: skip
 
 

@@ -294,7 +294,6 @@ class Upstream(NamedTuple):
     normal: np.ndarray  # (H, W, 3)
     ordered: np.ndarray  # (H, W)
     l2: np.ndarray  # (H, W)
-    exact: np.ndarray  # (H, W), or (0, W) if there is none
     weight: np.ndarray  # (M,), in the order of depth
 
 

@@ -145,19 +145,19 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
         ):
             scale = float(expected.abs().max())
             bound = 1e-4 * scale + 1e-9
-            if name in ("distortion_l1", "distortion_ordered") and leaf == 3:
+            if name == "distortion_ordered" and leaf == 3:
                 bound = max(bound, rounded)
             assert float((actual - expected).abs().max()) <= bound, (name, leaf, scale)
 
 
 def largest_terms_in_opacity(splats, camera, options, weights_of) -> float:
-    """The largest sum of sizes over pixels of a loss's terms of distortion_l1, as gradients in one
+    """The largest sum of sizes over pixels of a loss's terms of distortion_ordered, as gradients in one
     opacity."""
 
     def distortion(opacities):
         return render(
             dataclasses.replace(splats, opacities=opacities), camera, backend="reference", **options
-        ).distortion_l1
+        ).distortion_ordered
 
     step, largest = 1e-6, 0.0
     for k in range(len(splats.opacities)):
@@ -273,7 +273,9 @@ def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(
     def gradient() -> torch.Tensor:
         means = start.means.clone().requires_grad_()
         view = render(dataclasses.replace(start, means=means), camera)
-        (view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum()).backward()
+        (
+            view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_ordered.sum()
+        ).backward()
         assert means.grad is not None
         return means.grad
 
@@ -361,8 +363,8 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
 
 
 READ_BY_OWN_GRADIENTS = {
-    "alpha": {"depth", "distortion_ordered", "distortion_l1", "distortion_l2_ndc"},
-    "depth": {"depth", "distortion_ordered", "distortion_l1"},
+    "alpha": {"depth", "distortion_ordered", "distortion_l2_ndc"},
+    "depth": {"depth", "distortion_ordered"},
 }
 
 
@@ -465,7 +467,9 @@ def test_a_deep_scene_worked_off_from_the_front_is_the_same(
         monkeypatch.setattr(binned, "ENTRIES", entries)
         means = start.means.clone().requires_grad_()
         view = render(dataclasses.replace(start, means=means), camera)
-        (view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum()).backward()
+        (
+            view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_ordered.sum()
+        ).backward()
         assert means.grad is not None
         results.append(
             [getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS] + [means.grad]

@@ -74,7 +74,7 @@ def test_a_picture_changed_in_place_keeps_its_gradients(make_camera, make_splats
     def gradient(change: bool) -> torch.Tensor:
         means = splats.means.clone().requires_grad_()
         view = render(dataclasses.replace(splats, means=means), camera, backend="gpu")
-        outputs = [view.depth, view.distortion_l1, view.distortion_l2_ndc]
+        outputs = [view.depth, view.distortion_ordered, view.distortion_l2_ndc]
         if change:
             with torch.no_grad():
                 view.alpha.zero_()

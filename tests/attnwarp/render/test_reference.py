@@ -153,7 +153,7 @@ def test_one_splat_at_its_centre(backend, facing, front_camera) -> None:
     assert float(view.depth[middle]) == pytest.approx(4, abs=1e-6)
     assert float(view.median_depth[middle]) == pytest.approx(4, abs=1e-6)
     assert view.normal[middle].tolist() == pytest.approx([0, 0, -0.6], abs=1e-6)
-    assert float(view.distortion_l1[middle]) == pytest.approx(0, abs=1e-9)
+    assert float(view.distortion_ordered[middle]) == pytest.approx(0, abs=1e-9)
     # The footprint is that of a Gaussian of sigma f s / z = 5 pixels, down to 1/255.
     dx = torch.arange(33) + 0.5 - 16.5
     rho = (dx[:, None] ** 2 + dx**2) / 25
@@ -177,7 +177,7 @@ def test_two_splats_one_behind_the_other(backend, facing, front_camera) -> None:
     assert float(view.depth[at]) == pytest.approx((near * 3 + far * 5) / (near + far), abs=2e-6)
     # T before the second is 0.6 > 1/2, so the median is the second's.
     assert float(view.median_depth[at]) == pytest.approx(5, abs=1e-6)
-    assert float(view.distortion_l1[at]) == pytest.approx(2 * near * far * 2, abs=1e-6)
+    assert float(view.distortion_ordered[at]) == pytest.approx(2 * near * far * 2, abs=1e-6)
     m = [100 / 99.8 * (1 - 0.2 / z) for z in (3, 5)]
     assert float(view.distortion_l2_ndc[at]) == pytest.approx(
         near * far * (m[0] - m[1]) ** 2, rel=1e-5

@@ -112,6 +112,8 @@ def _duplicates(count: float) -> Shot:
 def _distortion(gap: float, way: Way) -> float:
     """Error of w_i w_j |z_i - z_j| over all pairs of facing discs on one ray, or of its gradient.
 
+    In the order of depth, the sum over those in front is that over all pairs.
+
     On the middle ray alpha is the opacity, so weights are powers and depths are as stored.
     """
     opacity, count, depth = 0.3, 6, 4.0
@@ -125,14 +127,21 @@ def _distortion(gap: float, way: Way) -> float:
     pairs, steps = np.outer(w, w), z[:, None] - z
     if way.direction == "forward":
         exact = math.fsum((pairs * abs(steps)).ravel())
-        return abs(float(made.render(way, base).distortion_l1[0, 0]) - exact) / depth
+        return abs(float(made.render(way, base).distortion_ordered[0, 0]) - exact) / depth
     means_of = base.means.clone().requires_grad_()
-    made.render(way, dataclasses.replace(base, means=means_of)).distortion_l1.sum().backward()
+    made.render(way, dataclasses.replace(base, means=means_of)).distortion_ordered.sum().backward()
     assert means_of.grad is not None
-    # Where depths are equal, any slope between -1 and 1 is a subgradient; pairs cancel in the sum.
+    # Where the gaps to those in front are declared to have no sign, any slope between -1 and 1 is a
+    # subgradient of each of their pairs; pairs cancel in the sum.
+    front = np.tril(np.ones((count, count)), -1)
+    order = np.argsort(z, kind="stable")
+    flat = (front * pairs[np.ix_(order, order)] * abs(steps[np.ix_(order, order)])).sum(axis=1)
+    flat = flat <= 2 * constants.GAP_MIN * z[order] * w[order]
+    loose = np.zeros((count, count), dtype=bool)
+    loose[np.ix_(order, order)] = (front > 0) & flat[:, None]
     slopes = means_of.grad[:, 2].double().numpy()
     apart = np.abs(slopes - 2 * (pairs * np.sign(steps)).sum(axis=1))
-    free = 2 * (pairs * ((steps == 0) & ~np.eye(count, dtype=bool))).sum(axis=1)
+    free = 2 * (pairs * (loose | loose.T)).sum(axis=1)
     return float(max((apart - free).max(), abs(slopes.sum())))
 
 
