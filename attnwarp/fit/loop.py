@@ -24,13 +24,12 @@ from attnwarp.fit.exposure import Exposure
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
-from attnwarp.fit.time_left import TimeLeft
 from attnwarp.fit.views import Views, warn_of_twins
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
 from attnwarp.render import Render, render
-from attnwarp.reporting import SILENT, Reporter, duration
+from attnwarp.reporting import SILENT, Pace, Reporter
 from attnwarp.workdir import CheckpointClock, Workdir, results_in
 
 Tensor = torch.Tensor
@@ -256,7 +255,6 @@ class _Run:
         self.extent = extent_of(views.cameras, start.world_means())
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
-        self.time_left = TimeLeft(settings, len(start), views.images[0][..., 0].size)
         self.model = Model(start, settings, self.extent)
         middle = centers.mean(0) - self.model.origin
         self.density = Density(settings, self.extent, middle, len(start), self.model.device)
@@ -379,8 +377,7 @@ class _Run:
             compile_kernels(s.kind, report, self.model.device)
         if not self.history:
             self.evaluate()
-        if self.iteration < s.iterations:
-            self.announce(report)
+        pace = Pace()
         while True:
             stopped = self._reason_to_stop(max_seconds, stop)
             if stopped:
@@ -392,9 +389,9 @@ class _Run:
             # Evaluate before the final report, so that the last displayed figures are the result's.
             if self.iteration % s.evaluate_every == 0 or self.iteration == s.iterations:
                 self.evaluate()
-            left = self.time_left.after(self.iteration, len(self.model))
+            left = pace.left(self.iteration, s.iterations)
             if max_seconds is not None:
-                left = min(left, max_seconds - self.seconds)
+                left = min(max_seconds - self.seconds, math.inf if left is None else left)
             report.step(self.iteration, s.iterations, self.figures(), left)
             if self.folder is not None and clock.due:
                 with clock.saving(), warnings.catch_warnings():
@@ -423,30 +420,6 @@ class _Run:
         if self.exposure is None:
             return self.model.snapshot()
         return {**self.model.snapshot(), "exposures": self.exposure.changes().detach()}
-
-    def announce(self, report: Reporter) -> None:
-        """Tell the expected time, from the pace of three iterations that change nothing."""
-        background = self.background(fitting=False)
-        for k in range(4):
-            if k == 1:  # the first loads and warms up
-                begin = time.perf_counter()
-            index = k % len(self.views)
-            gaussians = self.model.gaussians(sh_degree=self.sh_degree)
-            view = self.render(gaussians, self.views.cameras[index], background)
-            self.loss_of(view.color.float(), view, self.views.target(index, background)).backward()
-            self.model.clear()
-        pace = (time.perf_counter() - begin) / 3
-        seconds = self.time_left.expect(pace, self.iteration, len(self.model))
-        report.log(
-            f"{self.settings.iterations - self.iteration} iterations on {len(self.views)} pictures,"
-            f" {len(self.model)} splats{self._growth()}: about {duration(seconds)}"
-        )
-
-    def _growth(self) -> str:
-        most = self.settings.max_splats
-        if not self.density.active(self.iteration + 1):
-            return ""
-        return " and as many as it takes, so longer" if most is None else f", at most {most}"
 
     def drop_unseen(self) -> None:
         """Remove the splats that no fitted view shows."""

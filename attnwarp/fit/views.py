@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import json
-import os
 import warnings
-from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +21,6 @@ from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning, suggest
 from attnwarp.io import Dataset, FileFormatError, read_image
-from attnwarp.io.file import is_file
 from attnwarp.io.images import read_mask, weighted_by_alpha
 from attnwarp.reporting import Reporter
 
@@ -454,9 +452,14 @@ def _named_view(dataset: Dataset, name: str) -> int:
 
 
 def _apart(train: Dataset, test: Dataset) -> Dataset | None:
-    """Remove fitted views from the held-out part; None if no view is left."""
-    files = _file_keys([*train.image_paths, *test.image_paths])
-    again = twins(train.cameras, test.cameras, files[: len(train)], files[len(train) :])
+    """Remove fitted views from the held-out part, by equal files or poses; None if no view is
+    left."""
+    again = _twins(train.cameras, test.cameras)
+    for i, path in enumerate(test.image_paths):
+        for j, other in enumerate(train.image_paths):
+            if _equal(path, other):
+                again[i] = j
+                break
     if not again:
         return test
     rest = [i for i in range(len(test)) if i not in again]
@@ -469,15 +472,18 @@ def _apart(train: Dataset, test: Dataset) -> Dataset | None:
     return test.select(rest) if rest else None
 
 
-def twins(
-    fitted: Sequence[Camera],
-    held_out: Sequence[Camera],
-    fitted_keys: Sequence[Collection[Hashable]],
-    held_out_keys: Sequence[Collection[Hashable]],
-) -> dict[int, int]:
-    """Find held-out views that are also fitted on, and their fitted twins: views with a common key
-    or at the same pose."""
-    of_key = {key: j for j, keys in enumerate(fitted_keys) for key in keys}
+def _equal(one: Path | None, other: Path | None) -> bool:
+    """Return True if two files have the same bytes, as a copy and a link have."""
+    if one is None or other is None:
+        return False
+    try:
+        return filecmp.cmp(one, other, shallow=False)
+    except OSError:
+        return False
+
+
+def _twins(fitted: Sequence[Camera], held_out: Sequence[Camera]) -> dict[int, int]:
+    """Find held-out views at the pose of a fitted one, and that one, by their numbers."""
     both = [*fitted, *held_out]
     centers = np.array([camera.position for camera in both])
     extent = float(np.linalg.norm(np.ptp(centers, axis=0))) or 1.0
@@ -491,19 +497,13 @@ def twins(
             for camera in both
         ]
     )
-    known, result = poses[: len(fitted)], {}
-    for i, (pose, keys) in enumerate(zip(poses[len(fitted) :], held_out_keys, strict=True)):
-        same = np.abs(known - pose).max(axis=1) <= SAME_POSE
-        own = next((of_key[key] for key in keys if key in of_key), None)
-        if own is not None or same.any():
-            result[i] = int(same.argmax()) if own is None else own
-    return result
+    apart = np.abs(poses[len(fitted) :, None] - poses[: len(fitted)]).max(axis=2)
+    return {i: int(row.argmin()) for i, row in enumerate(apart) if row.min() <= SAME_POSE}
 
 
 def warn_of_twins(views: Views, held_out: Views) -> None:
-    """Warn of held-out pictures that equal fitted views by pixels or pose."""
-    keys = [[_pixel_keys(image) for image in each.images] for each in (views, held_out)]
-    again = twins(views.cameras, held_out.cameras, *keys)
+    """Warn of held-out pictures at the poses of fitted views."""
+    again = _twins(views.cameras, held_out.cameras)
     if again:
         warnings.warn(
             f"held_out: {_named(again, views.cameras, held_out.cameras)}, so that their PSNR is not"
@@ -519,31 +519,3 @@ def _named(again: dict[int, int], fitted: Sequence[Camera], held_out: Sequence[C
         f"{len(again)} of {len(held_out)} held-out views are fitted on too (first:"
         f" {held_out[first].name!r}, which is {fitted[twin].name!r})"
     )
-
-
-def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
-    """Collect keys that identify the file of each picture: the file's inode, under any name, and
-    its content, which is only read if another file has the same size.
-    """
-    stats = [path.stat() if path is not None and is_file(path) else None for path in paths]
-    sizes = Counter({(s.st_dev, s.st_ino): s.st_size for s in stats if s is not None}.values())
-    result: list[set[Hashable]] = []
-    first: dict[str, Path] = {}
-    for path, stat in zip(paths, stats, strict=True):
-        keys: set[Hashable] = set() if path is None else {os.path.realpath(path)}
-        if path is not None and stat is not None:
-            keys.add((stat.st_dev, stat.st_ino))
-            if sizes[stat.st_size] > 1:
-                content = hashlib.sha256(path.read_bytes()).hexdigest()
-                # Blank views are equal without being copies.
-                if first.setdefault(content, path) is path or _pixel_keys(read_image(path)):
-                    keys.add(content)
-        result.append(keys)
-    return result
-
-
-def _pixel_keys(image: npt.NDArray[Any]) -> set[Hashable]:
-    """Collect keys that identify a picture by its pixels; none for a uniform colour."""
-    if (image == image[0, 0]).all():
-        return set()
-    return {hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()}
