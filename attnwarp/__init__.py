@@ -4,8 +4,8 @@
 - :mod:`attnwarp.fit` and :mod:`attnwarp.render`: pictures to splats, and splats to pictures.
 - :mod:`attnwarp.warp`: correspondences, visibility and sampling between two views.
 - :mod:`attnwarp.editing`: editors, and recording, warping and injection of their attention.
-- :mod:`attnwarp.methods`: Algorithm 1 (:mod:`attnwarp.methods.attention_warping`), from one edited
-  view to an edited scene, and its baselines.
+- :mod:`attnwarp.methods`: Algorithm 1 (:mod:`attnwarp.methods.algorithms.attention_warping`), from
+  one edited view to an edited scene, and its baselines.
 - :mod:`attnwarp.encoders` and :mod:`attnwarp.losses`: helpers of tuning and metrics.
 """
 

@@ -31,7 +31,7 @@ from attnwarp.editing.memory import announced, weight_bytes
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.small import dtype_of, load_editor, thread_count
 from attnwarp.io.images import encode_png
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 from attnwarp.methods.pictures import edit_size, resized, to_bytes
 from benchmarks import command
 from benchmarks.injection import INJECTED, PLAIN, RECORDED, WARPED, measure

@@ -27,7 +27,7 @@ from attnwarp.editing.editor import STEPS, edit
 from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.small import load_editor, thread_count
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 from attnwarp.process import core_count
 from attnwarp.warp import (
     EXACT_DEPTH_TOLERANCE,

@@ -12,7 +12,7 @@ from attnwarp.editing.small import load_editor
 from attnwarp.fit import FitSettings, first_splats, fit, load_views
 from attnwarp.io import read_dataset
 from attnwarp.methods import AttentionWarpingSettings, preset
-from attnwarp.methods.attention_warping import AttentionWarping
+from attnwarp.methods.algorithms.attention_warping import AttentionWarping
 from attnwarp.methods.base import run
 
 

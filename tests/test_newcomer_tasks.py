@@ -25,7 +25,7 @@ from tiny_scenes import cameras, splats
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import METHODS, preset
 
-module = importlib.import_module("attnwarp.methods.attention_warping")
+module = importlib.import_module("attnwarp.methods.algorithms.attention_warping")
 weights, inject = [], module.inject
 
 def noted(*values, weight, **more):
@@ -159,7 +159,7 @@ from attnwarp.editing.layers import hooked
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.small import guide_of, load_editor
 from attnwarp.methods import attention_warping, preset
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 
 Path("toy").mkdir(exist_ok=True)
 Path("toy/model_index.json").write_text(json.dumps({"_class_name": "ToyPipeline"}))

@@ -9,7 +9,7 @@ from torch_threads import on_one_thread
 
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
-from attnwarp.methods.attention_warping import a_t, blend
+from attnwarp.methods.algorithms.attention_warping import a_t, blend
 from attnwarp_eval.stability.cases.editing import CASES
 from training.assess import carries
 

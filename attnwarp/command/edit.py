@@ -29,7 +29,7 @@ from attnwarp.command.marks import (
     write_marked,
 )
 from attnwarp.command.page import show_edit
-from attnwarp.command.page.orbit import check_film
+from attnwarp.command.page.turntable import check_film
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import announced
 from attnwarp.editing.segment import Mask, check_marks, segmenter_folders
@@ -53,11 +53,12 @@ from attnwarp.io import THIRD_SCALE, Dataset, write_ply
 from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, MethodSettings, Result
+from attnwarp.methods.attention_settings import AttentionWarpingSettings
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
+from attnwarp.methods.by_warps import SourceSettings
 from attnwarp.methods.change import say_drift, say_little
 from attnwarp.methods.features import Features
 from attnwarp.methods.pictures import Segment, check_view_aspect
-from attnwarp.methods.settings import AttentionWarpingSettings, SourceSettings
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
 from attnwarp.process import asked_to_stop, core_count

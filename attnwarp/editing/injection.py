@@ -86,8 +86,8 @@ def inject(
     """Blend recorded features into an editor's attention, at each layer's size, while the block
     runs. Steps and branches that were not recorded stay unchanged.
 
-    :func:`attnwarp.methods.attention_warping.inject` is this function with the paper's weight and
-    blend.
+    :func:`attnwarp.methods.algorithms.attention_warping.inject` is this function with the paper's
+    weight and blend.
 
     Args:
         editor: editor that the features were recorded from, or an equally shaped one.
@@ -101,7 +101,7 @@ def inject(
         ValueError: a timestep, branch or size does not match the recording, or the recorded run had
             fewer steps than planned; the message names the mismatch.
 
-    An example is at :func:`attnwarp.methods.attention_warping.a_t`.
+    An example is at :func:`attnwarp.methods.algorithms.attention_warping.a_t`.
     """
     plan, recorded, views = recording.plan, recording.plan.recorded, len(warps)
     if len(recording.timesteps) < plan.steps:

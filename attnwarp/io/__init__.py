@@ -10,7 +10,7 @@ from attnwarp.io.lens import Lens, undistorted_camera, undistorted_image
 from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
 from attnwarp.io.splat import read_splat, write_splat
 from attnwarp.io.transforms import read_transforms, write_transforms
-from attnwarp.io.undistort import undistort
+from attnwarp.io.undistortion import undistort
 
 __all__ = [
     "THIRD_SCALE",

@@ -6,40 +6,20 @@ folder=..., budget=..., report=...)``, and return a :class:`Result`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from importlib import import_module
-
-from attnwarp.errors import Named
-from attnwarp.methods.attention_warping import attention_warping
+from attnwarp.methods.algorithms.attention_warping import attention_warping
+from attnwarp.methods.algorithms.by_view import ByViewSettings, by_view
+from attnwarp.methods.algorithms.corresponding import CorrespondingSettings, corresponding
+from attnwarp.methods.algorithms.dge import DGESettings, dge
+from attnwarp.methods.algorithms.fused import FusedSettings, fused
+from attnwarp.methods.algorithms.gaussctrl import GaussCtrlSettings, gaussctrl
+from attnwarp.methods.algorithms.guided import GuidedSettings, guided
+from attnwarp.methods.algorithms.igs2gs import IGS2GSSettings, igs2gs
+from attnwarp.methods.algorithms.warped_reference import WarpedReferenceSettings, warped_reference
+from attnwarp.methods.attention_settings import AttentionWarpingSettings
 from attnwarp.methods.base import Options, Result, Round
-from attnwarp.methods.by_view import by_view
-from attnwarp.methods.corresponding import corresponding
-from attnwarp.methods.dge import dge
-from attnwarp.methods.fused import fused
-from attnwarp.methods.gaussctrl import gaussctrl
-from attnwarp.methods.guided import guided
-from attnwarp.methods.igs2gs import igs2gs
-from attnwarp.methods.settings import (
-    PRESETS,
-    AttentionWarpingSettings,
-    ByViewSettings,
-    CorrespondingSettings,
-    DGESettings,
-    FusedSettings,
-    GaussCtrlSettings,
-    GuidedSettings,
-    IGS2GSSettings,
-    MethodSettings,
-    WarpedReferenceSettings,
-    preset,
-)
-from attnwarp.methods.warped_reference import warped_reference
+from attnwarp.methods.doors import METHODS
+from attnwarp.methods.settings import PRESETS, MethodSettings, preset
 from attnwarp.workdir import Budget
-
-METHODS: Named[Callable[..., Result]] = Named(
-    {name: getattr(import_module(f"{__name__}.{name}"), name) for name in PRESETS}
-)
-"""Methods by name; each method with presets maps to the function of its module."""
 
 __all__ = [
     "METHODS",

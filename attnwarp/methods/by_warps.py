@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
@@ -10,12 +11,29 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.editing.schedule import Grid, Time
 from attnwarp.io.names import file_stems
+from attnwarp.methods.algorithms.by_view import ByViewSettings
 from attnwarp.methods.base import Method, edit_file
 from attnwarp.methods.geometry import Geometry, Warps
 from attnwarp.methods.pictures import Image, Size
-from attnwarp.methods.settings import AttentionWarpingSettings, CarriedSettings
 from attnwarp.methods.work import Work
-from attnwarp.warp import FeatureWarp, WarpedView
+from attnwarp.warp import PRESETS as WARPS
+from attnwarp.warp import FeatureWarp, WarpedView, WarpSettings
+
+
+@dataclass(frozen=True)
+class CarriedSettings(ByViewSettings):
+    """Settings shared by the methods that carry edits along warps of their own.
+
+    Args:
+        warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
+    """
+
+    warp: WarpSettings = WARPS["corrected"]
+
+
+@dataclass(frozen=True)
+class SourceSettings(CarriedSettings):
+    """Settings shared by those of them that give one view, the source, a part of its own."""
 
 
 class ByWarps(Method):
@@ -35,7 +53,7 @@ class ByWarps(Method):
         targets: Sequence[int] | None = None,
     ) -> None:
         self.work, self.names = work, file_stems(work.views.cameras)
-        self.geometry = Geometry(work, AttentionWarpingSettings(warp=settings.warp), warps)
+        self.geometry = Geometry(work, settings.warp, warps)
         if warps is not None:
             views = range(len(self.names))
             digest = self.geometry.digest(sources or views, targets or views)

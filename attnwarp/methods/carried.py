@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.editor import shared_noise
+from attnwarp.methods.attention_settings import AttentionWarpingSettings
 from attnwarp.methods.noise import FRESH, carried, own_seed
-from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.warp import WarpedView
 
 

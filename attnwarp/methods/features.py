@@ -11,7 +11,7 @@ from attnwarp.editing.editor import Editor, guided
 from attnwarp.editing.layers import Layer, choose_layers
 from attnwarp.editing.recording import RecordingPlan
 from attnwarp.editing.schedule import Size
-from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.attention_settings import AttentionWarpingSettings
 
 
 class Features:

@@ -11,19 +11,41 @@ import torch
 from attnwarp import check
 from attnwarp.digest import digest_each
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.work import Work
-from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, sample_at, warp_view
+from attnwarp.warp import (
+    Surface,
+    WarpedView,
+    WarpSettings,
+    parts_read,
+    render_surface,
+    sample_at,
+    warp_view,
+)
 
 Warps = Callable[[int, int], WarpedView]
 """Function that returns the warp from a source view to a target view, by their numbers."""
 
 
 class Geometry:
-    """Warps along the scene's geometry."""
+    """Warps along the scene's geometry.
 
-    def __init__(self, work: Work, settings: AttentionWarpingSettings, warps: Warps | None) -> None:
+    Args:
+        warps: external warps; None uses the splats' depth.
+        mask: True keeps a warp's mask, False every pixel with a depth.
+        depth_from: model of the depth: "frozen" is that before the edit, "current" the tuned one.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        settings: WarpSettings,
+        warps: Warps | None,
+        *,
+        mask: bool = True,
+        depth_from: str = "frozen",
+    ) -> None:
         self.work, self.settings, self.outside = work, settings, warps
+        self.mask, self.depth_from = mask, depth_from
         self._frozen: dict[int, Surface] = {}
 
     def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
@@ -31,9 +53,9 @@ class Geometry:
         s, views, segments = self.settings, self.work.views, self.work.segments
         if self.outside is not None:
             return self._masked(source, self.outside(source, target))
-        before = self.work.frozen if s.depth_from == "frozen" else model
+        before = self.work.frozen if self.depth_from == "frozen" else model
         reads: dict[str, Any] = {}
-        wanted = parts_read(s.warp)
+        wanted = parts_read(s)
         if "source_image" in wanted:
             reads["source_image"] = views.picture(source)
         if "target_image" in wanted:
@@ -44,7 +66,7 @@ class Geometry:
             before,
             views.cameras[source],
             views.cameras[target],
-            s.warp,
+            s,
             **reads,
             source_surface=self._surface(source, before),
             near=self.work.near,
@@ -54,7 +76,7 @@ class Geometry:
         return self._masked(source, warp)
 
     def _masked(self, source: int, warp: WarpedView) -> WarpedView:
-        if not self.settings.mask:
+        if not self.mask:
             warp = warp.with_mask(warp.rules["defined"])
         kept = self.work.views.masks[source]
         if kept is None:
@@ -67,7 +89,7 @@ class Geometry:
         if model is self.work.frozen and view in self._frozen:
             return self._frozen[view]
         surface = render_surface(
-            model, self.work.views.cameras[view], self.settings.warp,
+            model, self.work.views.cameras[view], self.settings,
             near=self.work.near, backend=self.work.backend,
         )  # fmt: skip
         if model is self.work.frozen:

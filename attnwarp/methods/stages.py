@@ -8,7 +8,7 @@ from itertools import chain, islice
 import numpy as np
 import torch
 
-from attnwarp.methods.settings import MOST_VIEWS, AttentionWarpingSettings
+from attnwarp.methods.attention_settings import MOST_VIEWS, AttentionWarpingSettings
 
 SOURCE_EVERY = 10
 """Interval in steps at which the released code tunes on the source."""

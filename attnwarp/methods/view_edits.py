@@ -24,6 +24,7 @@ from attnwarp.editing.schedule import Size, Time
 from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
+from attnwarp.methods.attention_settings import AttentionWarpingSettings
 from attnwarp.methods.base import ViewEdit, edit_file
 from attnwarp.methods.carried import carry, initial_noise
 from attnwarp.methods.features import Features
@@ -37,7 +38,6 @@ from attnwarp.methods.pictures import (
     to_bytes,
 )
 from attnwarp.methods.scene import checked_image
-from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.unseen import (
     SourceTokens,
     attending,
@@ -135,7 +135,9 @@ class ViewEdits:
         self.timestep = check_editor(work.editor, settings)
         self.folder = work.folder.path / RECORDING
         self.features = Features(work.editor, settings, self.folder if store == "disk" else store)
-        self.geometry = Geometry(work, settings, warps)
+        self.geometry = Geometry(
+            work, settings.warp, warps, mask=settings.mask, depth_from=settings.depth_from
+        )
         self.source = source
         self._recorded: RecordedSource | None = None
         self.about = {"source": self.names[source]}

@@ -88,7 +88,8 @@ class FeatureWarp:
 
         Returns:
             (B, H*W, C) in the source's dtype, 0 for a pixel without a source position. An edit
-            blends them into the target's tokens: :func:`attnwarp.methods.attention_warping.blend`.
+            blends them into the target's tokens:
+            :func:`attnwarp.methods.algorithms.attention_warping.blend`.
 
         Raises:
             ValueError: the shape differs from the source grid, or the dtype cannot be blended.

@@ -18,7 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.command.page.measured import CONTROL, disagreement, edited_alone, spill
-from attnwarp.command.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
+from attnwarp.command.page.turntable import (
+    degrees_apart,
+    focus_of,
+    orbit,
+    renders,
+    up_of,
+    write_film,
+)
 from attnwarp.editing.editor import Editor
 from attnwarp.fit import Views
 from attnwarp.fit.views import to_float

@@ -18,16 +18,16 @@ from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_ply
 from attnwarp.io.names import file_stems
-from attnwarp.methods.attention_warping import AttentionWarping
+from attnwarp.methods.algorithms.attention_warping import AttentionWarping
+from attnwarp.methods.algorithms.by_view import ByView, ByViewSettings
+from attnwarp.methods.algorithms.dge import DGE
+from attnwarp.methods.algorithms.gaussctrl import GaussCtrl
+from attnwarp.methods.algorithms.guided import Guided
+from attnwarp.methods.algorithms.igs2gs import IGS2GS
 from attnwarp.methods.base import Edit, edit_file
-from attnwarp.methods.by_view import ByView
-from attnwarp.methods.dge import DGE
-from attnwarp.methods.gaussctrl import GaussCtrl
-from attnwarp.methods.guided import Guided
-from attnwarp.methods.igs2gs import IGS2GS
 from attnwarp.methods.pictures import Bytes, Segment, to_bytes
 from attnwarp.methods.scene import near_of
-from attnwarp.methods.settings import PRESETS, ByViewSettings
+from attnwarp.methods.settings import PRESETS
 from attnwarp.methods.tuning import Order
 from attnwarp.methods.view_edits import RecordedSource
 from attnwarp.methods.work import Work

@@ -63,7 +63,7 @@ class Capture:
         source = names[0] if source is None else source
         one_of(source, names, "source")
         # Import here: the fit's losses and networks import slowly.
-        from attnwarp.command.page.orbit import focus_of, up_of
+        from attnwarp.command.page.turntable import focus_of, up_of
         from attnwarp.methods.scene import near_of
 
         self.near = near_of(cameras, model)

@@ -21,7 +21,7 @@ from torch import Tensor
 from attnwarp.editing.editor import Image, edit
 from attnwarp.editing.injection import Identity, Weight
 from attnwarp.editing.recording import Recording, RecordingPlan, record
-from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
+from attnwarp.methods.algorithms.attention_warping import CORRECTED, a_t, inject
 from attnwarp.warp import resize_mask
 from training.assess.card_sections import Kept, asked_for, percent, short_of
 from training.assess.editors import SEED

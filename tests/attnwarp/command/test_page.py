@@ -14,7 +14,7 @@ from PIL import Image
 from attnwarp import Camera
 from attnwarp.command import page as pages
 from attnwarp.command.page.measured import disagreement
-from attnwarp.command.page.orbit import check_film, focus_of, orbit, write_film
+from attnwarp.command.page.turntable import check_film, focus_of, orbit, write_film
 from attnwarp.errors import InputError
 from attnwarp.fit import Views
 from attnwarp.io import read_image, read_splat

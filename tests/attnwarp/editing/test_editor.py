@@ -33,7 +33,7 @@ from attnwarp.editing.schedule import (
 )
 from attnwarp.editing.small import WEIGHTS, bundled, guide_of, load_editor
 from attnwarp.errors import InputError, InputWarning
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 
 H, W = 16, 24
 

@@ -24,7 +24,7 @@ from attnwarp.editing.layers import (
     paper_layers,
 )
 from attnwarp.editing.recording import RecordingPlan, record
-from attnwarp.methods.attention_warping import a_t, inject
+from attnwarp.methods.algorithms.attention_warping import a_t, inject
 from attnwarp.warp import Surface, WarpSettings, warp_surfaces
 
 SIZE = (6, 8)

@@ -191,7 +191,7 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     from attnwarp.editing.editor import edit
     from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.editing.recording import RecordingPlan, record
-    from attnwarp.methods.attention_warping import inject
+    from attnwarp.methods.algorithms.attention_warping import inject
 
     pipe = pix2pix()
     editor = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)

@@ -21,7 +21,7 @@ from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import Flow
 from attnwarp.editing.small import guide_of, load_editor, own_steps_of
 from attnwarp.errors import InputError
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 
 STEPS = 3
 GRID = {"klein": (32, 33), "kontext": (5, 8), "qwen": (3, 2), "qwen-plus": (3, 2), "sd3": (7, 6)}

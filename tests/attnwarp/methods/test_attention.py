@@ -11,8 +11,8 @@ from drawn_lines import drawn_distances
 
 from attnwarp import Camera
 from attnwarp.methods import matching
+from attnwarp.methods.algorithms.dge import by_angle
 from attnwarp.methods.attention import aligned, self_attention
-from attnwarp.methods.dge import by_angle
 from attnwarp.methods.epipolar import line_distances
 from attnwarp.methods.matching import key_views, matches
 

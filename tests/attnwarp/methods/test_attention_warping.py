@@ -1060,7 +1060,7 @@ def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor, 
 
 def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     """Oracle: a recording of all steps, with the first steps' weights alone, and no warp."""
-    from attnwarp.methods.attention_warping import a_t, inject
+    from attnwarp.methods.algorithms.attention_warping import a_t, inject
 
     settings = replace(QUICK, feature_steps=(0.0, 0.5), stages=1, iterations=0, batch=1)
     everything = recorded(scene, editor, tmp_path, QUICK)

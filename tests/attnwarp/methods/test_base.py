@@ -32,7 +32,7 @@ from attnwarp.methods import (
     preset,
 )
 from attnwarp.methods import base as run_module
-from attnwarp.methods.by_view import ByView
+from attnwarp.methods.algorithms.by_view import ByView
 
 
 @pytest.fixture(scope="module")

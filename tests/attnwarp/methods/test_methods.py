@@ -1,8 +1,12 @@
 # ruff: noqa: F811  (fixtures that are imported)
 """Oracles: the editor's own loop, view by view itself, renders of the splats, counts of draws."""
 
+import importlib
+import inspect
 import json
-from dataclasses import replace
+import pkgutil
+import sys
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +23,7 @@ from attnwarp.editing.schedule import DDIM
 from attnwarp.io import read_ply
 from attnwarp.methods import (
     METHODS,
+    PRESETS,
     AttentionWarpingSettings,
     ByViewSettings,
     CorrespondingSettings,
@@ -286,7 +291,7 @@ def test_dge_draws_other_views_each_round_and_a_key_view_of_each_batch_at_each_s
 
 
 def test_gaussctrl_draws_ten_views_and_a_reference_of_each_quarter():
-    from attnwarp.methods.gaussctrl import _choice, _quarters, _spread_draw
+    from attnwarp.methods.algorithms.gaussctrl import _choice, _quarters, _spread_draw
 
     for seed in range(20):
         generator = torch.Generator().manual_seed(seed)
@@ -390,3 +395,29 @@ def test_a_view_alone_has_the_source_edit_of_attention_warping_at_the_same_seed(
         model, views, images, editor, "blue", AttentionWarpingSettings(stages=1, **same)
     )
     np.testing.assert_array_equal(alone.edited[0], warped.edited[0])
+
+
+def test_no_module_is_hidden_by_a_function_of_its_name():
+    """Oracle: the interpreter's table of modules."""
+    import attnwarp
+
+    names = [info.name for info in pkgutil.walk_packages(attnwarp.__path__, "attnwarp.")]
+    # The package warp is an extra's.
+    own = [n for n in names if not n.endswith("__main__") and "gpu" not in n]
+    modules = {n: importlib.import_module(n) for n in own}
+    assert "attnwarp.methods.algorithms.attention_warping" in modules
+    for name, module in modules.items():
+        parent, _, last = name.rpartition(".")
+        assert getattr(sys.modules[parent], last) is module, name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_each_method_has_its_documentation_its_settings_and_its_own_keywords(name):
+    method, of_settings = METHODS[name], type(next(iter(PRESETS[name].values())))
+    parameters = inspect.signature(method).parameters
+    first = ["gaussians", "cameras", "images", "editor", "instruction", "settings"]
+    assert list(parameters)[:6] == first and list(parameters)[-1] == "options"
+    assert parameters["settings"].annotation == f"{of_settings.__name__} | None"
+    assert method.__name__ == name and "Example:" in method.__doc__
+    warped = {f.name for f in fields(of_settings)} >= {"warp"}
+    assert warped == ("warps" in parameters) and not {"work", "self"} & parameters.keys()

@@ -15,10 +15,10 @@ from attnwarp.editing.layers import BareUNet, all_layers
 from attnwarp.editing.schedule import DDIM
 from attnwarp.fit import Views
 from attnwarp.methods import ByViewSettings, GuidedSettings
-from attnwarp.methods.corresponding import mixing
-from attnwarp.methods.fused import blended, guided_by, splat
-from attnwarp.methods.guided import Guided, guided_step, mosaic
-from attnwarp.methods.warped_reference import WarpedReference
+from attnwarp.methods.algorithms.corresponding import mixing
+from attnwarp.methods.algorithms.fused import blended, guided_by, splat
+from attnwarp.methods.algorithms.guided import Guided, guided_step, mosaic
+from attnwarp.methods.algorithms.warped_reference import WarpedReference
 from attnwarp.methods.work import Work
 from attnwarp.reporting import SILENT
 from attnwarp.warp import Surface, warp_surfaces

@@ -9,7 +9,7 @@ import pathlib
 import pytest
 from typer.testing import CliRunner
 
-from attnwarp.methods.attention_warping import AttentionWarping
+from attnwarp.methods.algorithms.attention_warping import AttentionWarping
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import compare, read_baseline, read_snapshot
 from attnwarp_eval.compare.pictures import pictures_of_baseline

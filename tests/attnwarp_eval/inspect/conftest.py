@@ -29,8 +29,7 @@ def folders(tmp_path_factory, one_thread):
     from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.io import Dataset, write_ply, write_transforms
     from attnwarp.io.images import encode_png
-    from attnwarp.methods import preset
-    from attnwarp.methods.attention_warping import attention_warping
+    from attnwarp.methods import attention_warping, preset
 
     folder = tmp_path_factory.mktemp("own")
     model = splats()

@@ -9,7 +9,7 @@ import torch
 from attnwarp.editing.editor import drawn, edit
 from attnwarp.editing.layers import hooked
 from attnwarp.editing.recording import RecordingPlan, record
-from attnwarp.methods.attention_warping import inject
+from attnwarp.methods.algorithms.attention_warping import inject
 from attnwarp_lab.ideal.editor import Answers, IdealEditor, tokens_of
 from attnwarp_lab.ideal.joint import IdealJointEditor
 

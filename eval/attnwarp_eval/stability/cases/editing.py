@@ -18,7 +18,7 @@ from attnwarp.editing.injection import blended
 from attnwarp.editing.layers import BareUNet, Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import DDIM, Prediction
-from attnwarp.methods.attention_warping import CORRECTED, a_t, blend, inject
+from attnwarp.methods.algorithms.attention_warping import CORRECTED, a_t, blend, inject
 from attnwarp.methods.pictures import to_bytes
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix

@@ -13,7 +13,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.editing.layers import BareUNet, Layer
 from attnwarp.editing.recording import RecordingPlan, record
-from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
+from attnwarp.methods.algorithms.attention_warping import CORRECTED, a_t, inject
 from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
 from attnwarp.warp.sampling import work_type
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix

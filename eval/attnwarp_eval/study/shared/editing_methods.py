@@ -17,12 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders import load_encoder
-from attnwarp.methods.settings import (
-    PRESETS,
-    AttentionWarpingSettings,
-    CarriedSettings,
-    SourceSettings,
-)
+from attnwarp.methods import PRESETS, AttentionWarpingSettings
+from attnwarp.methods.by_warps import CarriedSettings, SourceSettings
 from attnwarp.reporting import SILENT, Reporter
 
 if TYPE_CHECKING:
@@ -178,7 +174,7 @@ def _attention_warping(job: Job) -> EditedScene:
 
 def _with_features_of(job: Job, donor: Donor) -> EditedScene:
     """Attention warping of targets with features of the donor's source, edited alike."""
-    from attnwarp.methods.attention_warping import AttentionWarping
+    from attnwarp.methods.algorithms.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
 
     recordings: list[Recording] = []
@@ -226,7 +222,7 @@ def _true_pictures(job: Job) -> EditedScene:
     Raises:
         ValueError: a budget or a donor, neither of which means anything here.
     """
-    from attnwarp.methods.attention_warping import AttentionWarping
+    from attnwarp.methods.algorithms.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
 
     for name in ("budget", "donor"):

@@ -6,34 +6,65 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editor import edit
 from attnwarp.editing.editors.controlnet import DepthControlNet
 from attnwarp.editing.inversion import inversion_rows, invert_view
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
-from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
-from attnwarp.methods.settings import GaussCtrlSettings
+from attnwarp.methods.base import Loop, Method, ViewEdit
+from attnwarp.methods.doors import Door, door
+from attnwarp.methods.settings import (
+    STABLE_DIFFUSION,
+    Latents,
+    MethodSettings,
+)
 from attnwarp.methods.work import VIEWS, Guide, Work, chunks
+from attnwarp.settings import Count, Share
 
 
-def gaussctrl(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: GaussCtrlSettings | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class GaussCtrlSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.gaussctrl`.
+
+    Args:
+        views: number of edited views: an equal share of each contiguous part of the views, at
+            random; all views if there are fewer.
+        references: number of parts of the views; each part gives one reference view.
+        self_share: weight of a view's own keys in the UNet's self-attention; the rest is shared
+            equally by the reference views.
+        control_share: ``self_share`` for the ControlNet; None keeps its attention unchanged.
+        latents: initial latents of an edit: DDIM "inversion" of the render, or "random".
+        source_prompt: prompt of the inversion; None for the instruction.
+        suffix: suffix of the instruction.
+        negative_prompt: negative prompt of the unconditional branch; None for the editor's default.
+        batch: number of views per network pass, besides the reference views.
+
+    Example:
+        >>> from attnwarp.methods import GaussCtrlSettings
+        >>> GaussCtrlSettings().self_share
+        0.6
+    """
+
+    views: Count = 40
+    references: Count = 4
+    self_share: Share = 0.6
+    control_share: Share | None = None
+    latents: Latents = "inversion"
+    source_prompt: str | None = ""
+    suffix: str = ""
+    negative_prompt: str | None = None
+    batch: Count = 5
+
+
+class GaussCtrl(Method):
     """Edit views by depth with attention to reference views, then tune the splats on the edits.
 
     Each edit starts from the DDIM inversion of the view's render, without guidance, or from random
@@ -61,14 +92,6 @@ def gaussctrl(
         ValueError: editor: gaussctrl is made for a depth ControlNet, got InstructPix2Pix, which
         takes pictures; choose another editor or method
     """
-    return run(
-        "gaussctrl", GaussCtrl, GaussCtrlSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class GaussCtrl(Method):
-    """Method that edits views with attention to reference views."""
 
     def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
         work.takes("gaussctrl", "depth", DepthControlNet)
@@ -138,6 +161,17 @@ class GaussCtrl(Method):
                 steps=s.steps, seed=s.seed,
             )  # fmt: skip
         return self._latents[view]
+
+
+gaussctrl: Door[GaussCtrlSettings] = door(
+    GaussCtrl,
+    {
+        "default": GaussCtrlSettings(),
+        "paper": GaussCtrlSettings(**STABLE_DIFFUSION),
+        "released": GaussCtrlSettings(control_share=0.0, source_prompt=None, **STABLE_DIFFUSION),
+        "random": GaussCtrlSettings(latents="random", **STABLE_DIFFUSION),
+    },
+)
 
 
 def _quarters(views: Sequence[int], count: int) -> list[list[int]]:

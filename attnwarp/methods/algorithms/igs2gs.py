@@ -4,29 +4,49 @@ are tuned on them, the iterative dataset update of Instruct-NeRF2NeRF.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Unpack
 
-import numpy.typing as npt
-
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import Grid
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
-from attnwarp.methods.settings import IGS2GSSettings
+from attnwarp.methods.base import Loop, Method, ViewEdit
+from attnwarp.methods.doors import Door, door
+from attnwarp.methods.settings import (
+    MethodSettings,
+    checked_start,
+)
 from attnwarp.methods.work import Work, parts_of
+from attnwarp.settings import Count, Number
 
 
-def igs2gs(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: IGS2GSSettings | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class IGS2GSSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.igs2gs`.
+
+    Args:
+        every: number of tuning iterations between two edits of all views.
+        start: (lowest, highest) range of the starting timestep, drawn for each edit.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
+
+    Example:
+        >>> from attnwarp.methods import IGS2GSSettings
+        >>> settings = IGS2GSSettings(iterations=3000)
+        >>> settings.start, settings.iterations / settings.every  # a full round and a part
+        ((700, 980), 1.2)
+    """
+
+    iterations: Number = 7500
+    every: Count = 2500
+    start: tuple[int, int] = (700, 980)
+    grid: Grid = "even"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "start", checked_start(self.start))
+
+
+class IGS2GS(Method):
     """Edit every view from its noised render, tune the splats, and repeat.
 
     Each edit draws a timestep T of Stable Diffusion, noises the view's render by the current splats
@@ -52,14 +72,6 @@ def igs2gs(
         >>> result.counters["edits"]  # two rounds of two views
         4
     """
-    return run(
-        "igs2gs", IGS2GS, IGS2GSSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class IGS2GS(Method):
-    """Method that edits all views again after a fixed number of tuning iterations."""
 
     def __init__(self, work: Work, settings: IGS2GSSettings) -> None:
         work.takes("igs2gs", "picture")
@@ -84,3 +96,15 @@ class IGS2GS(Method):
         pictures = [work.render(view, model)]
         result = work.edit([view], step, number=number, start=start, pictures=pictures)
         return [ViewEdit(result.images[0], {"start": start, "timesteps": result.timesteps})]
+
+
+_RELEASED = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5, grid="scheduler")
+
+igs2gs: Door[IGS2GSSettings] = door(
+    IGS2GS,
+    {
+        "default": IGS2GSSettings(),
+        "released": _RELEASED,
+        "improved": replace(_RELEASED, iterations=3000),
+    },
+)

@@ -5,34 +5,69 @@ tokens are matched along epipolar lines.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Unpack
+from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
-from attnwarp.editing.schedule import following, published_steps
+from attnwarp.editing.schedule import Grid, following, published_steps
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.base import Loop, Method, ViewEdit
+from attnwarp.methods.doors import Door, door
 from attnwarp.methods.matching import key_views
-from attnwarp.methods.settings import DGESettings
+from attnwarp.methods.settings import LAST_STEP, MethodSettings
 from attnwarp.methods.work import KEYS, VIEWS, Work, chunks, parts_of
+from attnwarp.settings import Count, Number, Range, Weight
 
 
-def dge(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: DGESettings | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class DGESettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.dge`.
+
+    Args:
+        every: number of tuning iterations between two draws and edits of views.
+        views: number of views per round; all views if there are fewer.
+        batch: number of neighbouring views that share a key view.
+        starts: starting timestep of each round; the last also serves all further rounds.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
+        plain_below: timestep below which every view uses plain self-attention.
+        epipolar: distance from the epipolar line, in px of the layer, beyond which matches are
+            excluded; None excludes none.
+
+    Example:
+        >>> from attnwarp.methods import DGESettings
+        >>> DGESettings().starts  # nearly pure noise first, small changes after
+        (998, 299)
+    """
+
+    iterations: Number = 1500
+    l1: Weight = 10.0
+    ssim: Weight = 0.0
+    perceptual: Weight = 10.0
+    every: Count = 500
+    views: Count = 20
+    batch: Count = 5
+    starts: tuple[int, ...] = (998, 299)
+    grid: Grid = "even"
+    plain_below: Annotated[int, Range(0, 1000)] = 100
+    epipolar: Weight | None = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        right = all(check.is_number(t, whole=True) and 0 <= t <= LAST_STEP for t in self.starts)
+        if not self.starts or not right:
+            raise ValueError(
+                f"starts: got {self.starts!r}, expected timesteps of Stable Diffusion, in"
+                f" [0, {LAST_STEP}], at least one"
+            )
+
+
+class DGE(Method):
     """Edit views together through key views, tune the splats on them, and repeat with other views.
 
     The views of a round are sorted by their angle and cut into batches. At every step one view of
@@ -63,14 +98,6 @@ def dge(
         >>> result.counters["network_rows"]  # one key view and two views, two branches each
         6
     """
-    return run(
-        "dge", DGE, DGESettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class DGE(Method):
-    """Method that edits the views of a round together, through key views."""
 
     def __init__(self, work: Work, settings: DGESettings) -> None:
         work.takes("dge", "picture", InstructPix2Pix)
@@ -146,6 +173,15 @@ class DGE(Method):
         s = self.settings
         published = published_steps(self._start(number), s.steps, s.grid)
         return [timestep >= s.plain_below for timestep in published]
+
+
+dge: Door[DGESettings] = door(
+    DGE,
+    {
+        "default": DGESettings(),
+        "released": DGESettings(text_guidance=7.5, image_guidance=1.5, grid="scheduler"),
+    },
+)
 
 
 def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:

@@ -4,25 +4,27 @@ look like the views edited before at the points that both show.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Unpack, cast
+from typing import Annotated, cast
 
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import Schedule, Time, following
 from attnwarp.encoders import load_encoder
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
-from attnwarp.methods.by_warps import ByWarps, checked_source
+from attnwarp.methods.base import Loop, ViewEdit
+from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
+from attnwarp.methods.doors import SourceDoor, door
 from attnwarp.methods.geometry import Warps
-from attnwarp.methods.settings import GuidedSettings
+from attnwarp.methods.settings import (
+    LAST_STEP,
+)
 from attnwarp.methods.tuning import PerceptualLoss
 from attnwarp.methods.work import VIEWS, Work
+from attnwarp.settings import Count, Number, Range, Weight
 from attnwarp.warp import FeatureWarp
 
 PUBLISHED_SIDE = 512
@@ -32,18 +34,40 @@ Loss = Callable[[Tensor], Tensor]
 """Loss () of (3, h, w) pixels in [0, 1]."""
 
 
-def guided(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: GuidedSettings | None = None,
-    *,
-    source: int = 0,
-    warps: Warps | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class GuidedSettings(SourceSettings):
+    """Settings of :func:`attnwarp.methods.guided`.
+
+    Args:
+        batch: unused; views are edited one at a time.
+        partners: number of views edited before that guide a view.
+        below: timestep of Stable Diffusion below which steps are guided.
+        forward: weight of the gradient through the network; 0 takes none.
+        backward: number of steps of the predicted picture at each guided step.
+        rate: share of Polyak's step that each of them takes.
+        points, patches: largest numbers of matched points and patches.
+        patch: side of the patches in px of a picture of 512 px; others are scaled alike.
+        patch_weight: weight of the patches' perceptual distance against L1.
+
+    Example:
+        >>> from attnwarp.methods import GuidedSettings
+        >>> GuidedSettings(below=1000)
+        Traceback (most recent call last):
+        ValueError: below: got 1000, expected a whole number in [0, 999]
+    """
+
+    partners: Count = 2
+    below: Annotated[int, Range(0, LAST_STEP)] = 700
+    forward: Weight = 0.1
+    backward: Number = 3
+    rate: Weight = 0.3
+    points: Count = 50_000
+    patches: Count = 1_500
+    patch: Count = 64
+    patch_weight: Weight = 2.0
+
+
+class Guided(ByWarps):
     """Edit views in order, each guided by the edited views of most matches, then tune the splats.
 
     The loss is L1 at matched points plus ``patch_weight`` times the perceptual distance of patches
@@ -75,17 +99,9 @@ def guided(
         >>> result.counters["network_rows"]  # two steps of two views, two branches each
         8
     """
-    return run(
-        "guided", partial(Guided, source=source, warps=warps), GuidedSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class Guided(ByWarps):
-    """Method that edits views in order, guided by those before."""
 
     def __init__(
-        self, work: Work, settings: GuidedSettings, source: int, warps: Warps | None
+        self, work: Work, settings: GuidedSettings, source: int = 0, warps: Warps | None = None
     ) -> None:
         if settings.start is not None:
             work.starts_at(settings.start[0], "start")
@@ -161,6 +177,15 @@ class Guided(ByWarps):
             return difference + s.patch_weight * self.perceptual.between(patches, target)
 
         return of
+
+
+guided: SourceDoor[GuidedSettings] = door(
+    Guided,
+    {
+        "default": GuidedSettings(),
+        "paper": GuidedSettings(text_guidance=7.5, image_guidance=1.5),
+    },
+)
 
 
 def mosaic(picture: Tensor, centers: Tensor, side: int) -> Tensor:

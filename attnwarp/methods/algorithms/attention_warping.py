@@ -23,9 +23,10 @@ from attnwarp.editing.editor import Editor
 from attnwarp.editing.injection import TokenWarp
 from attnwarp.editing.recording import record
 from attnwarp.gaussians import Gaussians
+from attnwarp.methods.attention_settings import PRESETS, AttentionWarpingSettings
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.doors import register
 from attnwarp.methods.geometry import Warps
-from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.stages import draw_stages, released_order
 from attnwarp.methods.view_edits import RecordedSource, ViewEdits
 from attnwarp.methods.work import Work, chunks
@@ -236,3 +237,6 @@ class AttentionWarping(Method):
             "feature_bytes": sum(about.get("feature_bytes", 0) for about in records.values()),
             "injected": sum(shares) / len(shares) if shares else 0.0,
         }
+
+
+register("attention_warping", attention_warping, PRESETS)

@@ -3,29 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import Any, Unpack
+from typing import Any
 
-import numpy.typing as npt
-
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
-from attnwarp.methods.settings import ByViewSettings
+from attnwarp.methods.base import Loop, Method, ViewEdit
+from attnwarp.methods.doors import Door, door
+from attnwarp.methods.settings import (
+    MethodSettings,
+    checked_start,
+)
 from attnwarp.methods.work import Work, chunks
+from attnwarp.settings import Count, Number, Weight
 
 
-def by_view(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: ByViewSettings | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class ByViewSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.by_view`.
+
+    The losses, rates and iterations equal those of
+    :class:`attnwarp.methods.AttentionWarpingSettings`, so the two methods differ only in the edits.
+
+    Args:
+        start: (lowest, highest) range of the starting timestep, drawn for each edit; None for pure
+            noise.
+        batch: number of views per network pass; 1 if ``start`` is given and the noise is fresh.
+            Results depend on it in the last bits.
+
+    Example:
+        >>> from attnwarp.methods import ByViewSettings
+        >>> ByViewSettings(batch=0)
+        Traceback (most recent call last):
+        ValueError: batch: got 0, expected a whole number >= 1
+    """
+
+    iterations: Number = 900
+    ssim: Weight = 0.0
+    perceptual: Weight = 1.0
+    normal: Weight = 0.05
+    distortion: Weight = 0.01
+    color_rate: Weight = 4.0
+    start: tuple[int, int] | None = None
+    batch: Count = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "start", checked_start(self.start))
+
+
+class ByView(Method):
     """Edit every view alone, then tune the splats on all of them.
 
     Args:
@@ -53,14 +81,6 @@ def by_view(
         >>> result.edited[1].shape, result.counters["edits"]
         ((32, 32, 3), 2)
     """
-    return run(
-        "by_view", ByView, ByViewSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class ByView(Method):
-    """Method that edits every view alone and tunes the splats on all views."""
 
     def __init__(self, work: Work, settings: ByViewSettings) -> None:
         if settings.start is not None:
@@ -95,3 +115,6 @@ class ByView(Method):
         if start is not None:
             about["timesteps"] = result.timesteps
         return [ViewEdit(picture, about) for picture in result.images]
+
+
+by_view: Door[ByViewSettings] = door(ByView, {"default": ByViewSettings()})

@@ -5,41 +5,66 @@ views' edits, fused into the view along depth.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Unpack
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, tensor_of
+from attnwarp.editing.editor import tensor_of
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix, Pix2PixTask
-from attnwarp.editing.schedule import following
+from attnwarp.editing.schedule import Grid, following
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
-from attnwarp.methods.by_warps import ByWarps
+from attnwarp.methods.base import Loop, ViewEdit
+from attnwarp.methods.by_warps import ByWarps, CarriedSettings
+from attnwarp.methods.doors import WarpsDoor, door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.pictures import Image, Segment, Size
-from attnwarp.methods.settings import FusedSettings
+from attnwarp.methods.settings import needs_start
 from attnwarp.methods.work import Work
+from attnwarp.settings import Count, Share
 
 Array = npt.NDArray[Any]
 
 
-def fused(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: FusedSettings | None = None,
-    *,
-    warps: Warps | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class FusedSettings(CarriedSettings):
+    """Settings of :func:`attnwarp.methods.fused`.
+
+    Args:
+        start: (lowest, highest) range of the starting timestep, drawn for each edit.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
+        batch: unused; views are edited one at a time.
+        nearest: number of other views that are fused.
+        fusion_share: s_M / (s_S + s_M), the part of the image guidance that leads to the fusion.
+        occlusion: True lets the nearest of a view's pixels that fall into one win, False the last.
+        holes: picture where no view's pixels fall, the "original" or "black".
+        perceptual_scaled: False feeds the perceptual loss pictures in [0, 1] as if they were in
+            [-1, 1].
+
+    Example:
+        >>> from attnwarp.methods import preset
+        >>> preset("fused", "released").holes
+        'black'
+    """
+
+    start: tuple[int, int] | None = (700, 980)
+    grid: Grid = "even"
+    nearest: Count = 5
+    fusion_share: Share = 2 / 3
+    occlusion: bool = True
+    holes: Literal["original", "black"] = "original"
+    perceptual_scaled: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        needs_start(self.start)
+
+
+class Fused(ByWarps):
     """Edit every view twice, alone and guided by the fused edits of others, then tune the splats.
 
     The nearest views' first edits are splatted into a view and blended into F, outside the segment
@@ -70,16 +95,8 @@ def fused(
         >>> result.counters["network_rows"]  # two branches of a view, then six rows
         16
     """
-    return run(
-        "fused", partial(Fused, warps=warps), FusedSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
 
-
-class Fused(ByWarps):
-    """Method that edits views alone, then again guided by the nearest views' edits."""
-
-    def __init__(self, work: Work, settings: FusedSettings, warps: Warps | None) -> None:
+    def __init__(self, work: Work, settings: FusedSettings, warps: Warps | None = None) -> None:
         work.takes("fused", "picture", InstructPix2Pix)
         assert settings.start is not None
         work.starts_at(settings.start[0], "start")
@@ -149,6 +166,21 @@ class Fused(ByWarps):
         if s.holes == "original":
             picture = np.where(seen[..., None], picture, before)
         return work.composite(view, np.clip(picture, 0, 1).astype(np.float32))
+
+
+_PAPER = FusedSettings(
+    text_guidance=7.5, image_guidance=1.5, grid="scheduler", iterations=1000, normal=0.0,
+    distortion=0.0, color_rate=1.0,
+)  # fmt: skip
+
+fused: WarpsDoor[FusedSettings] = door(
+    Fused,
+    {
+        "default": FusedSettings(),
+        "paper": _PAPER,
+        "released": replace(_PAPER, occlusion=False, holes="black", perceptual_scaled=False),
+    },
+)
 
 
 def splat(

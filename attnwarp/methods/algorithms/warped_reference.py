@@ -5,37 +5,48 @@ starts from. In small the projection and refinement of GeM-NR (Bengtson et al. 2
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import Any, Unpack
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
-from attnwarp.methods.by_warps import ByWarps, checked_source
+from attnwarp.methods.base import Loop, ViewEdit
+from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
+from attnwarp.methods.doors import SourceDoor, door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.pictures import Image
-from attnwarp.methods.settings import WarpedReferenceSettings
+from attnwarp.methods.settings import (
+    needs_start,
+)
 from attnwarp.methods.work import Work, chunks
 
 
-def warped_reference(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: WarpedReferenceSettings | None = None,
-    *,
-    source: int = 0,
-    warps: Warps | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class WarpedReferenceSettings(SourceSettings):
+    """Settings of :func:`attnwarp.methods.warped_reference`.
+
+    Args:
+        start: (lowest, highest) range of the timestep to which start pictures are noised; one is
+            drawn for all views. The source starts from pure noise.
+
+    Example:
+        >>> from attnwarp.methods import WarpedReferenceSettings
+        >>> WarpedReferenceSettings(start=None)
+        Traceback (most recent call last):
+        ValueError: start: got None, but views begin at pictures; give [lowest, highest]
+    """
+
+    start: tuple[int, int] | None = (700, 700)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        needs_start(self.start)
+
+
+class WarpedReference(ByWarps):
     """Edit a source view, then each other view from the source's warped edit, and tune the splats.
 
     A view starts from M S_warp + (1 - M) I: S_warp is the source's edit warped along the splats'
@@ -63,18 +74,13 @@ def warped_reference(
         >>> list(result.edited)  # the source, then the other view
         [0, 1]
     """
-    return run(
-        "warped_reference", partial(WarpedReference, source=source, warps=warps),
-        WarpedReferenceSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class WarpedReference(ByWarps):
-    """Method that edits views from the source's warped edit."""
 
     def __init__(
-        self, work: Work, settings: WarpedReferenceSettings, source: int, warps: Warps | None
+        self,
+        work: Work,
+        settings: WarpedReferenceSettings,
+        source: int = 0,
+        warps: Warps | None = None,
     ) -> None:
         assert settings.start is not None
         work.starts_at(settings.start[0], "start")
@@ -119,3 +125,8 @@ class WarpedReference(ByWarps):
         mask = warp.mask.numpy()
         picture = np.where(mask[..., None], warped, before).astype(np.float32)
         return picture, float(mask.mean())
+
+
+warped_reference: SourceDoor[WarpedReferenceSettings] = door(
+    WarpedReference, {"default": WarpedReferenceSettings()}
+)

@@ -6,40 +6,49 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Unpack
+from typing import Any
 
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, Latent
+from attnwarp.editing.editor import Latent
 from attnwarp.editing.layers import Call, Layer, Network, all_layers, check_rows, hooked
 from attnwarp.editing.schedule import Size
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
-from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
-from attnwarp.methods.by_warps import ByWarps, checked_source
+from attnwarp.methods.base import Loop, ViewEdit
+from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
+from attnwarp.methods.doors import SourceDoor, door
 from attnwarp.methods.geometry import Warps
-from attnwarp.methods.settings import CorrespondingSettings
 from attnwarp.methods.work import Work, chunks
+from attnwarp.settings import Count, Share
 from attnwarp.warp import FeatureWarp
 from attnwarp.warp.sampling import work_type
 
 
-def corresponding(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[npt.NDArray[Any]] | None,
-    editor: Editor,
-    instruction: str,
-    settings: CorrespondingSettings | None = None,
-    *,
-    source: int = 0,
-    warps: Warps | None = None,
-    **options: Unpack[Options],
-) -> Result:
+@dataclass(frozen=True)
+class CorrespondingSettings(SourceSettings):
+    """Settings of :func:`attnwarp.methods.corresponding`.
+
+    Args:
+        self_share: weight of a view's own keys in its self-attention; the rest is attention to the
+            source view, which then is in every batch. Below 1 the editor must be Stable
+            Diffusion's.
+        batch: number of views per network pass, whose tokens are mixed.
+
+    Example:
+        >>> from attnwarp.methods import preset
+        >>> preset("corresponding", "released").self_share
+        0.7
+    """
+
+    batch: Count = 40
+    self_share: Share = 1.0
+
+
+class Corresponding(ByWarps):
     """Edit views together, mixing the tokens that show one point, then tune the splats.
 
     The output of each self-attention becomes sum_l w_l h_l(W_l p): p is the token's point, l are
@@ -72,17 +81,13 @@ def corresponding(
         >>> result.counters["network_rows"]  # two views, two branches each
         4
     """
-    return run(
-        "corresponding", partial(Corresponding, source=source, warps=warps), CorrespondingSettings,
-        gaussians, cameras, images, editor, instruction, settings, **options,
-    )  # fmt: skip
-
-
-class Corresponding(ByWarps):
-    """Method that edits the views of a batch with their tokens mixed."""
 
     def __init__(
-        self, work: Work, settings: CorrespondingSettings, source: int, warps: Warps | None
+        self,
+        work: Work,
+        settings: CorrespondingSettings,
+        source: int = 0,
+        warps: Warps | None = None,
     ) -> None:
         work.one_size("corresponding")
         if settings.start is not None:
@@ -132,6 +137,15 @@ class Corresponding(ByWarps):
             result = work.edit(views, step, start=start)
         edits = dict(zip(views, result.images, strict=True))
         return [ViewEdit(edits[view], {"start": start}) for view in batch]
+
+
+corresponding: SourceDoor[CorrespondingSettings] = door(
+    Corresponding,
+    {
+        "default": CorrespondingSettings(),
+        "released": CorrespondingSettings(self_share=0.7, text_guidance=6.0, iterations=1000),
+    },
+)
 
 
 @contextmanager
