@@ -65,7 +65,7 @@ def tried(
     place = choose(device, splats=False)
     kind = dtype_of(dtype, place, name)
     about: dict[str, Any] = {k: version(k) for k in PACKAGES}
-    about |= {"machine": platform.platform(), "announced": announced(name, kind, place, size)}
+    about |= {"machine": platform.platform(), "announced": announced(name, kind, place)}
     about["device"] = place if place == "cpu" else torch.cuda.get_device_name()
     start = time.perf_counter()
     editor = load_editor(name, device=place, dtype=kind)

@@ -116,7 +116,7 @@ def edit_image(
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
     kind = dtype_of(dtype, device, editor)
-    if line := announced(editor, kind, device, size):
+    if line := announced(editor, kind, device):
         typer.echo(line, err=True)
     model = load_editor(editor, device=device, dtype=kind, low_memory=low_memory, **given)
     model.check_text(instruction)

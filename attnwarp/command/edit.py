@@ -150,8 +150,7 @@ def edit_dataset(
     """
     index = view_of(dataset, options.source)
     device = choose(options.device, report)
-    store = out if own.get("store") == "disk" else own.get("store", "cpu")
-    editor = _editor(editor_name, device, options, settings, store, report)
+    editor = _editor(editor_name, device, options, report)
     editor.check_text(instruction)
     if settings.size is None:
         settings = settings.changed(size=editor.own_size)
@@ -243,24 +242,10 @@ def _by_hand(
     return by_hand
 
 
-def _editor(
-    name: str,
-    device: str,
-    options: EditOptions,
-    settings: MethodSettings,
-    store: str | Path,
-    report: Reporter,
-) -> Any:
-    """Load the editor; before, report its memory and that of a source's features."""
-    recorded = None
-    if isinstance(settings, AttentionWarpingSettings) and settings.a0 > 0:
-        warping = settings
-
-        def recorded(empty: Any, size: tuple[int, int]) -> str:
-            return str(Features(empty, warping, store).plan(size))
-
+def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
+    """Load the editor; before, report its memory."""
     dtype = dtype_of(options.dtype, device, name)
-    if line := announced(name, dtype, device, settings.size, recorded):
+    if line := announced(name, dtype, device):
         report.log(line)
     return load_editor(name, device=device, dtype=dtype, low_memory=options.low_memory)
 

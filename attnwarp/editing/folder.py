@@ -107,26 +107,6 @@ def load_pipeline(
     return {**parts, "scheduler": _scheduler(folder)}
 
 
-def load_empty(folder: Path, networks: Mapping[str, str], dtype: torch.dtype) -> dict[str, Any]:
-    """Build a pipeline's transformer and autoencoder without weights, on torch's device "meta", and
-    its scheduler; text encoders and tokenizers are None.
-    """
-    import diffusers
-
-    parts: dict[str, Any] = {}
-    for name, kind in networks.items():
-        if name.startswith("text_encoder"):
-            parts |= {name: None, _tokenizer_of(name): None}
-            continue
-        with readable(folder / name), torch.device("meta"):
-            network = getattr(diffusers, kind).from_config(config_of(folder, name))
-            # diffusers' own `to` warns.
-            parts[name] = torch.nn.Module.to(network, dtype)
-    if (folder / "processor").is_dir():
-        parts["processor"] = None
-    return {**parts, "scheduler": _scheduler(folder)}
-
-
 def _scheduler(folder: Path) -> Any:
     import diffusers
 

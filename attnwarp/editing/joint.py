@@ -205,42 +205,6 @@ class Joint(Coder):
         """Read settings from a folder's model_index.json."""
         return {}
 
-    @classmethod
-    def rehearsed(
-        cls, folder: Path, dtype: torch.dtype, size: int | None = None
-    ) -> tuple[Self, int, int]:
-        """Find the memory of an edit without weights: its networks run on torch's device "meta"."""
-        from attnwarp.editing.folder import index_of, load_empty
-        from attnwarp.editing.memory import peak_bytes
-
-        parts = load_empty(folder, cls.networks, dtype)
-        config = parts["transformer"].config
-
-        class Empty(cls):  # type: ignore[valid-type,misc]
-            def embed(self, words: str, pictures: Sequence[Tensor]) -> dict[str, Any]:
-                views = len(pictures[0])
-                shapes = {
-                    "encoder_hidden_states": (views, self.words[1], config.joint_attention_dim),
-                    "pooled_projections": (views, config.get("pooled_projection_dim")),
-                }
-                return {
-                    name: torch.empty(shape, dtype=dtype, device="meta")
-                    for name, shape in shapes.items()
-                    if None not in shape
-                }
-
-        editor = Empty(**parts, **cls.told(index_of(folder)))
-        side = -(-(size or cls.own_size) // editor.side_multiple) * editor.side_multiple
-        view = np.zeros((side, side, 3), np.float32)
-        latents = torch.empty(1, *editor.noise_shape((side, side)), dtype=dtype, device="meta")
-        task = editor.task([view], "")
-        runs = (
-            lambda: editor.encode([view]),
-            lambda: task.predict(latents, 0.5),
-            lambda: editor.pixels(latents),
-        )
-        return editor, side, max(map(peak_bytes, runs))
-
     # --- layers
 
     @classmethod

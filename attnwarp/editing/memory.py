@@ -1,18 +1,13 @@
-"""Memory of an editor: its weights and activations, and diffusers' memory-saving options."""
+"""Memory of an editor: its weights, and diffusers' memory-saving options."""
 
 from __future__ import annotations
 
 import json
 import math
-import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from attnwarp.devices import device_of
 from attnwarp.editing.editor import Editor
@@ -59,97 +54,26 @@ def _tensor_bytes(path: Path, dtype: torch.dtype) -> int:
     return sum(math.prod(tensor["shape"]) for tensor in head.values()) * dtype.itemsize
 
 
-class _Live(TorchDispatchMode):
-    """Counter of the bytes of live tensors that operations create."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now = self.most = 0
-        self._seen: set[int] = set()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        # A view of what an operation reads, such as of a weight, is no new memory.
-        read = {s._cdata for s in _storages((args, kwargs))}
-        for storage in _storages(result):
-            if storage._cdata not in self._seen | read:
-                self._seen.add(storage._cdata)
-                self.now += storage.nbytes()
-                self.most = max(self.most, self.now)
-                weakref.finalize(storage, self._free, storage._cdata, storage.nbytes())
-        return result
-
-    def _free(self, key: int, count: int) -> None:
-        self._seen.discard(key)
-        self.now -= count
-
-
-def _storages(values: Any) -> list[Any]:
-    tensors = (value for value in tree_leaves(values) if isinstance(value, torch.Tensor))
-    return [tensor.untyped_storage() for tensor in tensors]
-
-
-class _Fused(TorchFunctionMode):
-    """Attention as fused kernels run it: without its table of scores."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.nn.functional.scaled_dot_product_attention:
-            return torch.empty_like(args[0] if args else kwargs["query"])
-        return func(*args, **(kwargs or {}))
-
-
-def peak_bytes(run: Callable[[], Any]) -> int:
-    """Measure the largest number of bytes that tensors created by a function hold at once.
-
-    Attention counts as fused. On torch's device "meta" nothing is computed or held.
-
-    Example:
-        >>> def twice():
-        ...     x = torch.zeros(10, dtype=torch.float32, device="meta")
-        ...     return x + 1
-        >>> peak_bytes(twice)
-        80
-    """
-    with torch.no_grad(), _Live() as live, _Fused():
-        run()
-    return live.most
-
-
-def announced(
-    name_or_folder: str,
-    dtype: torch.dtype,
-    device: str,
-    size: int | None = None,
-    recorded: Callable[[Editor, tuple[int, int]], str] | None = None,
-) -> str | None:
-    """Describe the memory of an editor's weights, a view's edit and its features, before anything
-    is loaded.
-
-    Args:
-        size: side of a square view in px; the editor's own if omitted.
-        recorded: (editor without weights, (h, w) of a view's latents) -> words on features.
+def announced(name_or_folder: str, dtype: torch.dtype, device: str) -> str | None:
+    """Describe the memory of an editor's weights, before anything is loaded; None for a small
+    editor on a processor.
 
     Example:
         >>> announced("small-plain", torch.float16, "cuda")
         'weights of the editor in float16: 0.01 GiB'
     """
+    from attnwarp.editing.joint import Joint
     from attnwarp.editing.small import bundled, folders_of, kind_of
 
     folder, control = folders_of(name_or_folder)
     plain = name_or_folder in bundled() or control is not None
-    rehearse = None if plain else getattr(kind_of(folder), "rehearsed", None)
-    if rehearse is None and device == "cpu":
+    if device == "cpu" and (plain or not issubclass(kind_of(folder), Joint)):
         return None
     weights = folder_bytes(folder, dtype)
     if control is not None and control.parent != folder:
         weights += folder_bytes(control, dtype)
     kind = str(dtype).removeprefix("torch.")
-    line = f"weights of the editor in {kind}: {weights / 2**30:.2f} GiB"
-    if rehearse is None:
-        return line
-    editor, side, peak = rehearse(folder, dtype, size)
-    line += f"; an edit of a view of {side} x {side} px beside them: {peak / 2**30:.2f} GiB"
-    return f"{line}; {recorded(editor, editor.noise_shape((side, side))[1:])}" if recorded else line
+    return f"weights of the editor in {kind}: {weights / 2**30:.2f} GiB"
 
 
 def save_memory(editor: Editor, device: str) -> None:

@@ -463,31 +463,11 @@ def test_what_a_folder_cannot_give_is_refused_by_name(klein, tmp_path):
         load_editor(str(other))
 
 
-def test_memory_is_announced_before_anything_is_loaded(klein, monkeypatch):
-    """Oracles: the loaded weights, and every allocation that torch's profiler saw."""
+def test_the_memory_of_weights_is_announced_before_anything_is_loaded(klein):
+    """Oracle: the loaded weights."""
     folder, _ = klein
     weights = folder_bytes(folder, torch.float32)
-    editor = load_editor(str(folder))
     # A tied tensor is stored once, and a counter of the norm is no weight.
-    assert weights == pytest.approx(weight_bytes(editor), rel=0.1)
-    line = announced(str(folder), torch.bfloat16, "cpu", 64)
-    assert line.startswith(
-        "weights of the editor in bfloat16: 0.00 GiB; an edit of a view of 64 x 64"
-    )
-    # Before weights are read, a distilled model is known to have one branch.
-    said = announced(str(folder), torch.bfloat16, "cpu", 64, lambda *empty: f"features of {empty}")
-    assert said.startswith(f"{line}; features of (<") and said.endswith("(64, 64))")
-    empty, side, peak = type(editor).rehearsed(folder, torch.float32, 64)
-    assert empty.branches == editor.branches and empty.network.device.type == "meta"
-    view = np.zeros((side, side, 3), np.float32)
-    task, latents = editor.task([view], "red"), drawn((1, *editor.noise_shape((side, side))), 0)
-    most = 0
-    for run in (lambda: task.predict(latents, 0.5), lambda: editor.pixels(latents)):
-        with torch.no_grad(), torch.profiler.profile(profile_memory=True) as profile:
-            run()
-        now = 0
-        for event in profile.profiler.kineto_results.events():
-            if event.name() == "[memory]":
-                now += event.nbytes()
-                most = max(most, now)
-    assert peak == pytest.approx(most, rel=0.1)
+    assert weights == pytest.approx(weight_bytes(load_editor(str(folder))), rel=0.1)
+    line = announced(str(folder), torch.bfloat16, "cpu")
+    assert line == "weights of the editor in bfloat16: 0.00 GiB"
