@@ -1,4 +1,4 @@
-"""How much of its pictures a fit explains."""
+"""Likeness of a fit to its pictures, beside that of their own mean colours."""
 
 from __future__ import annotations
 

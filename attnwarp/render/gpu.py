@@ -10,9 +10,9 @@ reference.
 5. Backward: each pixel's splats back to front. A splat's gradients are summed over a warp's
    pixels, then added to its row in float64, and taken to the parameters and the pose.
 
-The host waits for the device once per picture, for the number of entries and of ties; once more
-if the pose has a gradient. Pictures and weights have the same bits in
-every run, gradients up to the order of sums in float64: 1e-15 of the largest term.
+The host waits for the device once per picture, for the number of entries and of ties; once more if
+the pose has a gradient. Pictures and weights have the same bits in every run, gradients up to the
+order of sums in float64: 1e-15 of the largest term.
 
 Kernels run on the splats' device. For CPU tensors that is Warp's CPU device, on one thread: far
 slower than backend "cpu", with the same results. Tests use this device; the backend has never run

@@ -20,6 +20,7 @@ from attnwarp import Camera, Gaussians, methods
 from attnwarp.editing.editor import edit
 from attnwarp.editing.inversion import ddim_invert
 from attnwarp.editing.schedule import DDIM
+from attnwarp.fit import Views
 from attnwarp.io import read_ply
 from attnwarp.methods import (
     METHODS,
@@ -37,6 +38,7 @@ from attnwarp.methods import (
     by_view,
     preset,
 )
+from attnwarp.methods.geometry import Geometry
 from attnwarp.methods.pictures import to_bytes
 from attnwarp.methods.work import Work
 from attnwarp.render import render
@@ -117,6 +119,22 @@ def test_splats_seen_only_where_masks_ignore_the_pictures_keep_their_bytes(name,
     assert hidden.sum() == 3
     assert not changed(masks=[right] * 3)[hidden].any()
     assert changed()[hidden].all()
+
+
+def test_no_feature_comes_from_what_the_sources_mask_ignores(scene, editor):
+    """Oracle: where the warp without masks reads the source."""
+    model, views, images = scene
+    left = np.arange(32)[None].repeat(32, 0) < 16
+    settings = AttentionWarpingSettings()
+
+    def warp(*masks):
+        work = work_of(model, Views(views, images, masks), editor, settings)
+        return Geometry(work, settings, None).warp(0, 1, model)
+
+    whole, part = warp(), warp(left, None, None)
+    read = whole.correspondence.xy[..., 0]
+    assert torch.equal(part.mask, whole.mask & (read < 16)) and part.mask.any()
+    assert (part.mask != whole.mask).any()
 
 
 def test_view_by_view_with_shared_noise_is_the_editors_own_loop(run, scene, editor):
@@ -210,8 +228,6 @@ def test_igs2gs_edits_every_view_in_every_round_from_the_render_as_tuned(
 
 
 def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
-    from attnwarp.fit import Views
-
     model, views, images = scene
     work = work_of(model, Views(views, images), editor, IGS2GSSettings())
     drawn = [work.timestep(number, view, (20, 29)) for number in range(100) for view in range(10)]
@@ -226,8 +242,6 @@ def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
 
 def test_depth_shows_no_splat_that_no_picture_shows(editor):
     """Oracle: the plane of the wall. A disc hangs 0.1 before the first of two cameras 40 apart."""
-    from attnwarp.fit import Views
-
     view = {"width": 32, "height": 32, "fov_y": 40, "up": (0, 1, 0)}
     views = [Camera.look_at((x, 0, 20), (x, 0, 0), **view) for x in (-20.0, 20.0)]
     discs = Gaussians(

@@ -275,3 +275,17 @@ def test_each_mask_needs_its_camera():
         lift_masks(ball_on_plane(), [camera((3, 0, 1.0))], [np.zeros((96, 96), dtype=bool)] * 2)
     with pytest.raises(ValueError, match="masks: got none"):
         lift_masks(ball_on_plane(), [], [])
+
+
+def test_pixels_that_are_not_kept_have_no_vote():
+    """Oracle: a patch of the plane, marked by mistake, whose surroundings are not marked."""
+    scene, view = ball_on_plane(), camera((0, -3, 2))
+    ball, patch = ball_mask(view), np.zeros((96, 96), dtype=bool)
+    patch[74:84, 42:54] = True
+    assert not (patch & ball).any()
+
+    def share(kept):
+        lifted = lift_masks(scene, [view], [ball | patch], kept=kept)
+        return float(lifted.render(view)[77:81, 45:51].mean())
+
+    assert share(None) > 0.5 > 0.1 > share([~patch])
