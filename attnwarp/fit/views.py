@@ -161,6 +161,21 @@ class Views:
             transparent |= image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
         object.__setattr__(self, "transparent", transparent)
 
+    @classmethod
+    def unchecked(
+        cls,
+        cameras: Sequence[Camera],
+        images: Sequence[npt.NDArray[Any]],
+        masks: Sequence[npt.NDArray[np.bool_] | None],
+        exposures: Sequence[npt.NDArray[np.floating[Any]] | None],
+    ) -> Views:
+        """Collect opaque pictures that are sound by their making, without looking at any."""
+        views = object.__new__(cls)
+        views.__dict__.update(
+            cameras=cameras, images=images, masks=masks, exposures=exposures, transparent=False
+        )
+        return views
+
     def __len__(self) -> int:
         return len(self.cameras)
 

@@ -558,9 +558,9 @@ class _Run:
             self._cut("seconds", number, self.places[number])
 
     def _training(self, numbers: Sequence[int]) -> Views:
-        """Collect views with their edits at full size, to tune on."""
+        """Collect views with their edits at full size, each made when it is drawn, to tune on."""
         of = self.work.views
-        return Views(
+        return Views.unchecked(
             [of.cameras[k] for k in numbers],
             Drawn([partial(self._target, k) for k in numbers], HELD_BYTES),
             [of.masks[k] for k in numbers],
