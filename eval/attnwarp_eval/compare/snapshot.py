@@ -36,8 +36,6 @@ class Measured:
         definition: hash of all inputs of its figures except the seed.
         counters: counts of work.
         figures: gated metrics by key.
-
-    A cell whose figures depend on the machine has neither counters nor figures.
     """
 
     scene: str
@@ -104,8 +102,7 @@ def snapshot(results: Results) -> Snapshot:
 
 
 def _measured(cell: Outcome, record: Record[Any]) -> Measured:
-    repeatable = probe(cell.probe).repeatable(record)
-    names = {key for view in record.views for key in view.metrics} if repeatable else set()
+    names = {key for view in record.views for key in view.metrics}
     keys = sorted(filter(gated, names))
     figures = {
         key: Figure(
@@ -124,7 +121,7 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
         cell.variants,
         cell.seed,
         definition(record.spec),
-        dict(record.cost.counters) if repeatable else {},
+        dict(record.cost.counters),
         figures,
     )
 

@@ -1,4 +1,4 @@
-"""Controls of a study of edits: detection of wrong features and of another seed by its figures."""
+"""Controls of a study of edits: detection of wrong features by its figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from attnwarp_eval.statistics.intervals import ByView, common
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.shared.controls import OTHER_SEED
 from attnwarp_eval.study.shared.edits import VariantPart
 
 HALF = 0.5
@@ -142,11 +141,10 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
 
 
 def seen(results: Results, name: str, metric: str, baseline: str, label: str) -> bool:
-    """Return True if a figure tells a control from its variant: worse, or different for a seed."""
+    """Return True if a figure tells a control from its variant, as worse."""
     direction = probe(name).metric(metric).direction
     judged = between(results, name, baseline, label, metric).verdict(direction)  # type: ignore[arg-type]
-    other_seed = results.study.variants[label].part(VariantPart).control == OTHER_SEED
-    return judged in (("better", "worse") if other_seed else ("worse",))
+    return judged == "worse"
 
 
 def outcome_of(results: Results, name: str, metric: str, baseline: str) -> Outcome:
@@ -155,11 +153,10 @@ def outcome_of(results: Results, name: str, metric: str, baseline: str) -> Outco
     Features from the wrong place must do worse. Otherwise the figure does not depend on the
     source of features, so "can't tell" about two warps says nothing.
     """
-    of = controls_of(results, name, baseline).items()
-    wrong = [label for label, control in of if control != OTHER_SEED]
-    if not wrong:
+    of = controls_of(results, name, baseline)
+    if not of:
         return UNCONTROLLED
-    any_seen = any(seen(results, name, metric, baseline, label) for label in wrong)
+    any_seen = any(seen(results, name, metric, baseline, label) for label in of)
     return Outcome("seen" if any_seen else "not seen")
 
 
@@ -180,8 +177,7 @@ def controls(results: Results) -> list[Section]:
         return []
     text = (
         "A control takes features from the wrong place, so it has to do worse: then a figure has"
-        " seen it. A figure that sees none of them is blind to where features come from. The same"
-        " variant with another seed must not be seen."
+        " seen it. A figure that sees none of them is blind to where features come from."
     )
     return [Section("Controls", [text], tables, folded=True)]
 
@@ -195,18 +191,17 @@ def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:
     rows = [
         [
             label,
-            "not seen" if control == OTHER_SEED else "seen",
+            "seen",
             *(
                 "seen" if seen(results, name, metric, baseline, label) else "not seen"
                 for metric in metrics
             ),
         ]
-        for label, control in controls.items()
+        for label in controls
     ]
-    if set(controls.values()) != {OTHER_SEED}:
-        answers = [
-            "sees" if outcome_of(results, name, m, baseline).seen == "seen" else "blind"
-            for m in metrics
-        ]
-        rows.append(["this figure is", "", *answers])
+    answers = [
+        "sees" if outcome_of(results, name, m, baseline).seen == "seen" else "blind"
+        for m in metrics
+    ]
+    rows.append(["this figure is", "", *answers])
     yield Table(["control", "expected", *metrics], rows, f"Controls of {baseline!r}")

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from statistics import fmean
-
-import numpy as np
+from collections.abc import Collection, Mapping
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
@@ -14,7 +11,6 @@ from attnwarp_eval.document.numbers import number, ratio_text, spread
 from attnwarp_eval.statistics.intervals import (
     RATIO_INTERVAL,
     Interval,
-    front_probability,
     interval,
 )
 from attnwarp_eval.statistics.intervals import front as pareto
@@ -66,34 +62,14 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         if timed is None:
             marked = [[*row, "by one pass" if row[0] in on_front else "–"] for row in rows]
         else:
-            columns.append("probability")
-            chances = _probabilities(timed, shared, list(points))
             marked = [
-                [*row, "yes" if row[0] in on_front else "no", chances[row[0]]]
-                if row[0] in points
-                else [*row, "–", "–"]
+                [*row, ("yes" if row[0] in on_front else "no") if row[0] in points else "–"]
                 for row in rows
             ]
         section.tables.append(Table(columns, marked, front.title, folded=True))
         section.tables += _cheapest(results, shared, points, time)
     section.text += [" ".join(ranges)] if ranges else []
     return [section] if section.tables or len(section.text) > len(text) else []
-
-
-def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:
-    """Probability that each variant is on the front; a dash for one scene, which says nothing about
-    others.
-    """
-    means = np.array(
-        [[fmean(row.values()) for _, row in sorted(shared.tables[n].items())] for n in names]
-    )
-    scenes = means.shape[1]
-    if scenes < 2:
-        return dict.fromkeys(names, "–")
-    drawn = np.random.default_rng(0).integers(scenes, size=(DRAWS, scenes))
-    cost = np.array([timed.resampled(name, DRAWS) for name in names])
-    shares = front_probability(cost, means[:, drawn].mean(axis=-1))
-    return {name: f"{share:.2f}" for name, share in zip(names, shares, strict=True)}
 
 
 def _cheapest(
@@ -140,8 +116,7 @@ def _once(stage: str) -> str:
     advice = f": a study with a {able} probe takes them in turn" if able else ""
     return (
         "These seconds come from one pass over the views, each variant at another time, as the"
-        f" median over scenes, and are for orientation{advice}. So a front is of that one pass, and"
-        " nothing is said of how probable it is."
+        f" median over scenes, and are for orientation{advice}. So a front is of that one pass."
     )
 
 
@@ -155,8 +130,7 @@ def _in_turn(timed: Timed) -> str:
         f" ratio to the first contestant within a round; {RATIO_INTERVAL}"
         " The row `again` is the first contestant against itself: what noise alone does on this"
         " machine. Inside that band, or its mirror image about 1, nothing is called faster or"
-        f" slower. The probability of being on the front is the share of {DRAWS} draws, of scenes"
-        " and of rounds with replacement, in which a variant is on it."
+        " slower."
     )
 
 

@@ -109,6 +109,9 @@ def _study(data: Any) -> Study:
             # Committed results have it, for edits bit-identical to those with a0: 0.
             del variant["options"]["method"]
             variant["options"]["a0"] = 0.0
+        if variant.get("control") == "another seed":
+            # No key says it any more. A drift by 0 keeps it apart from the variant it repeats.
+            variant |= {"control": None, "drift": {}}
         # Committed results have arms of several sources, which no edit has any more.
         variant.get("options", {}).pop("sources", None)
     try:

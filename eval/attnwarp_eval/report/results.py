@@ -88,8 +88,6 @@ def lines(results: Results, timings: bool = True) -> Iterable[str]:
                 "views": values,
                 "counters": dict(record.cost.counters),
             }
-            if not probe(cell.probe).repeatable(record):
-                row["repeatable"] = False
             if timings:
                 row["seconds"] = dict(record.cost.seconds)
                 row["peak_memory_mb"] = record.cost.peak_memory_mb

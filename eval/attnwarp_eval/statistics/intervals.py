@@ -325,21 +325,3 @@ def front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
             indices.append(i)
             best = float(e[i])
     return indices
-
-
-def front_probability(cost: FloatArray, error: FloatArray) -> list[float]:
-    """The share of draws in which each point is on the Pareto front.
-
-    Args:
-        cost: (points, draws), such as seconds of resampled rounds.
-        error: (points, draws) of the same draws; less is better.
-
-    Example:
-        >>> cost = np.array([[1.0, 1.0], [2.0, 2.0]])
-        >>> front_probability(cost, np.array([[0.5, 0.5], [0.4, 0.6]]))
-        [1.0, 0.5]
-    """
-    counts = np.zeros(len(cost))
-    for costs, errors in zip(cost.T, error.T, strict=True):
-        counts[front(costs, errors)] += 1
-    return [float(share) for share in counts / cost.shape[1]]

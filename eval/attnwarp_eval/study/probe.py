@@ -238,10 +238,6 @@ class Probe(ABC, Generic[E]):
         """Specification of a figure. KeyError: this probe has no such figure."""
         return self.metrics[key]
 
-    def repeatable(self, record: Record[E]) -> bool:
-        """Return True if another machine gives the same figures; comparisons skip others."""
-        return True
-
     def in_turn(self, cell: Outcome, record: Record[E]) -> InTurn | None:
         """Seconds of contestants, if this probe times them."""
         return None

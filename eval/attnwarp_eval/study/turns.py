@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from attnwarp_eval.statistics.intervals import FloatArray, Interval, Ratio, time_ratio
+from attnwarp_eval.statistics.intervals import Interval, Ratio, time_ratio
 from attnwarp_eval.study.probe import InTurn, probe
 from attnwarp_eval.study.results import Results
 
@@ -61,22 +61,6 @@ class Timed:
         ratio, base, nan = self.ratio(name), self.base, float("nan")
         low, high = base * ratio.low, base * ratio.high
         return Interval(base * ratio.ratio, low, high, 1, 1, 0, nan, nan)
-
-    def resampled(self, name: str, draws: int) -> FloatArray:
-        """(draws,) :meth:`seconds` of rounds resampled with replacement in each cell, the same
-        rounds for every contestant of a cell; independent of other draws with the same seed.
-        """
-        medians = []
-        for index, turn in enumerate(self.turns):
-            if name in turn.names:
-                own, base = (
-                    np.log(turn.seconds[self.stage][turn.names.index(n)])
-                    for n in (name, turn.names[0])
-                )
-                drawn = np.random.default_rng([index, 1]).integers(len(own), size=(draws, len(own)))
-                medians.append(np.median((own - base)[drawn], axis=1))
-        seconds: FloatArray = self.base * np.exp(np.mean(medians, axis=0))
-        return seconds
 
     def judge(self, ratio: Ratio) -> str:
         """Verdict "faster" or "slower", outside the band of the baseline against itself."""

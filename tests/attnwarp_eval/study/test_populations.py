@@ -151,16 +151,16 @@ def test_a_population_that_cannot_be_is_refused_with_its_line(study_file, scenes
 
 
 def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it(tmp_path):
-    """The seeds in the cells themselves; a scene's are equal but for the control with another."""
+    """The seeds in the cells themselves; those of a scene's methods are equal."""
     (tmp_path / "my.yaml").write_text(
-        "extends: ablation\nname: my\nvariants: {another seed: {control: another seed}}\n"
-        "probes: {editing: [corrected, each view alone, another seed]}\nablations: []\n"
+        "extends: ablation\nname: my\n"
+        "probes: {editing: [corrected, each view alone]}\nablations: []\n"
         "fronts: []\npictures: null\n"
     )
     study = load_study(str(tmp_path / "my.yaml"), scenes=["drawn-2", "drawn-5"])
     seeds = defaultdict(set)
     for cell in cells_of(study, {name: load_scene(name) for name in scene_files(study)}):
         if cell.probe == "editing":
-            seeds[cell.scene, "another seed" in cell.labels].add(cell.spec["settings"]["seed"])
+            seeds[cell.scene].add(cell.spec["settings"]["seed"])
     assert all(len(own) == 1 for own in seeds.values())
-    assert len(set.union(*seeds.values())) == len(seeds) == 4
+    assert len(set.union(*seeds.values())) == len(seeds) == 2

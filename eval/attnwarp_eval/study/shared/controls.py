@@ -1,7 +1,7 @@
-"""Controls of studies of edits: features from a wrong source, and other noise.
+"""Controls of studies of edits: features from a wrong source.
 
 If a metric does not separate a method from wrong features, the study cannot judge where features
-come from. A metric that separates two seeds of one method is too sensitive.
+come from.
 """
 
 from __future__ import annotations
@@ -14,17 +14,13 @@ from torch import Tensor
 
 from attnwarp.warp import FeatureWarp, WarpedView
 
-Control = Literal["mirrored", "displaced", "another scene", "another seed"]
+Control = Literal["mirrored", "displaced", "another scene"]
 
 OTHER_SCENE: Control = "another scene"
 """Control whose features are those of the next scene's source, edited under the same words."""
 
-OTHER_SEED: Control = "another seed"
-"""Negative control: the same variant with another seed for noise and stages."""
-
-SEED_STEP, SCENE_STEP = 1_000_003, 1009
-"""Offset of the seed of :data:`OTHER_SEED` from the study's, and of a drawn scene's seed from the
-previous scene's."""
+SCENE_STEP = 1009
+"""Offset of a drawn scene's seed from the previous scene's."""
 
 DISPLACEMENT = 1 / 8
 """Share of the source's width by which ``displaced`` shifts the sampled features."""

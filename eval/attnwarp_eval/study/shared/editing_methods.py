@@ -83,7 +83,7 @@ class Job:
         warps: the warp from the source to a target by their numbers, in place of the method's own.
         truth: the true edited views by answer, in the order of ``cameras``. Only methods that
             bound others may look at it.
-        budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
+        budget: limits of the method; None for none.
         donor: donor of the features that targets get in place of the source's; None for the
             source's.
         segments: (H, W) share of each view that is edited, outside which nothing may change; None
@@ -153,7 +153,6 @@ class Method:
         settings: complete settings as JSON, from a preset's name (None where the study names none),
             the fields of a study and a variant, and the seed. ValueError: an unknown field or a
             value out of range.
-        takes_budget: whether it can be cut short by a budget.
         edited: how many of a number of views it edits at most with these settings; None where that
             is not known.
         needs_truth: whether it reads the true edited views.
@@ -161,7 +160,6 @@ class Method:
 
     settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
-    takes_budget: bool = False
     edited: Callable[[Mapping[str, Any], int], int] | None = None
     needs_truth: bool = False
 
@@ -278,7 +276,7 @@ def _method(name: str) -> Method:
 
         return dict(preset(name, wanted, **fields, seed=seed).to_dict())
 
-    return Method(settings, partial(_edited_by, name), takes_budget=True, edited=_drawn_views)
+    return Method(settings, partial(_edited_by, name), edited=_drawn_views)
 
 
 def _edited_by(name: str, job: Job) -> EditedScene:

@@ -8,19 +8,16 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.record import Extra, Json
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
-from attnwarp_eval.study.shared.budgets import BudgetPart
 from attnwarp_eval.study.shared.controls import (
     OTHER_SCENE,
-    OTHER_SEED,
     SCENE_STEP,
-    SEED_STEP,
     Control,
 )
 from attnwarp_eval.study.shared.drifts import DriftPart
@@ -91,8 +88,8 @@ class VariantPart(Part):
     ``options`` are fields of the method's settings that override the study's; a ``preset`` among
     them is applied before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
     ``source`` words. ``mask: truth`` injects where the source truly sees the
-    surface, ``geometry: truth`` warps by exact depth. ``budget`` limits the method.
-    ``control`` takes features from the wrong place or scene, or uses another seed
+    surface, ``geometry: truth`` warps by exact depth.
+    ``control`` takes features from the wrong place or scene
     (:mod:`attnwarp_eval.study.shared.controls`). ``drift`` makes the editor move what it edits.
     """
 
@@ -100,23 +97,26 @@ class VariantPart(Part):
     options: dict[str, Any] = Field(default_factory=dict)
     mask: Literal["rules", "truth"] = "rules"
     editor: EditorPart | None = None
-    budget: BudgetPart | None = None
     control: Control | None = None
     drift: DriftPart | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_budget(cls, data: Any) -> Any:
+        # Stored runs have the key, which is null where a variant had no budget.
+        kept = isinstance(data, dict) and data.get("budget", 0) is None
+        return {k: v for k, v in data.items() if k != "budget"} if kept else data
 
 
 class MethodProbe(Probe[E]):
     """Base of probes that run a variant's editing method."""
 
     edits = True
-    whole = False
-    """True if methods run to their end: ``budget`` has no effect."""
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with its settings, the editor, and the sources of splats and warps."""
         own = variant.part(VariantPart)
-        settings = settings_of(study, variant, seed + SEED_STEP * (own.control == OTHER_SEED))
-        limits: Json = {} if self.whole else self._budget_spec(study, variant, seed)
+        settings = settings_of(study, variant, seed)
         return {
             "spp": study.spp,
             "method": own.method,
@@ -125,8 +125,7 @@ class MethodProbe(Probe[E]):
             "geometry": variant.geometry,
             "mask": own.mask,
             **splats_spec(study, variant, seed),
-            **limits,
-            **({"control": own.control} if own.control not in (None, OTHER_SEED) else {}),
+            **({"control": own.control} if own.control else {}),
             **({"drift": own.drift.model_dump()} if own.drift else {}),
         }
 
@@ -155,25 +154,13 @@ class MethodProbe(Probe[E]):
         """Further entries of a cell's spec on the other scene."""
         return {}
 
-    def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Limits of the method; for another variant's seconds, the full spec of its run."""
-        part = variant.part(VariantPart).budget
-        if part is None:
-            return {}
-        budget = part.model_dump(exclude_none=True)
-        reference = reference_of(variant)
-        if reference is not None:
-            other = study.variants[reference]
-            budget["seconds_of"] = self.variant_spec(study, other, seed)
-        return {"budget": budget}
-
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Everything that decides a cell except its seed."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, 0)
         return (
             own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
-            editor_of(study, variant), own.budget, own.control, own.drift,
+            editor_of(study, variant), own.control, own.drift,
         )  # fmt: skip
 
 
@@ -213,12 +200,6 @@ def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     name = next((preset for preset in presets if preset is not None), None)
     warp = {f"warp.{key}": value for key, value in variant.set.items()}
     return EDITING_METHODS[own.method].settings(name, {**fields, **warp}, seed)
-
-
-def reference_of(variant: Variant) -> str | None:
-    """The name of the variant whose seconds limit this one."""
-    budget = variant.part(VariantPart).budget
-    return None if budget is None else budget.seconds_of
 
 
 def editor_of(study: Study, variant: Variant) -> EditorPart:

@@ -37,7 +37,6 @@ from attnwarp_eval.world import World, changed
 
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Editor
-    from attnwarp.methods import Budget
 
 EDITING_PARTS = ("source", "warp", "edit")
 """Parts of a method's seconds except tuning and display."""
@@ -60,7 +59,6 @@ def run_method(
     truth: EditTruth,
     names: Sequence[str],
     before: Gaussians,
-    budget: Budget | None = None,
     editor: Editor | None = None,
     donor: Donor | None = None,
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
@@ -98,9 +96,8 @@ def run_method(
             Path(folder),
             _warps(work, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},
-            budget,
-            donor,
-            segments,
+            donor=donor,
+            segments=segments,
         )
         with _work_counted(work.meter, editor):
             result = EDITING_METHODS[spec["method"]].run(job)
@@ -215,6 +212,5 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
 
 
 def is_alone(spec: Mapping[str, Any]) -> bool:
-    """Return True if a variant's spec edits each view alone and without a budget."""
-    itself = spec["method"] == FLOOR or spec["settings"].get("a0") == 0
-    return itself and "budget" not in spec
+    """Return True if a variant's spec edits each view alone."""
+    return bool(spec["method"] == FLOOR or spec["settings"].get("a0") == 0)

@@ -87,7 +87,6 @@ class IdealProbe(MethodProbe[IdealResult]):
     name = "ideal"
     protocol = 2
     study_part = EdgesPart
-    whole = True
     metrics = metrics_of("parts.", "edit.drift")
 
     def check(self, study: Study) -> None:

@@ -2,8 +2,6 @@
 
 import dataclasses
 import hashlib
-import itertools
-import json
 import math
 import re
 from pathlib import Path
@@ -18,20 +16,15 @@ from torch_threads import on_one_thread
 
 import attnwarp_eval
 from attnwarp.encoders.bundled import WEIGHTS
-from attnwarp.methods import Budget
 from attnwarp_eval import metrics
-from attnwarp_eval.compare.snapshot import read_snapshot
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probes.editing import measure
-from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.shared import edit_figures, edits
-from attnwarp_eval.study.shared.budgets import Spent, Stopwatch
 from attnwarp_eval.study.shared.edit_truth import edit_truth
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.work import compute
@@ -284,113 +277,6 @@ def test_a_compared_method_edits_every_view_with_its_own_settings(folder, tmp_pa
     assert (counters["edits"], counters["iterations"], record.extra.edited) == (4, 3, 4)
 
 
-ROWS = 2
-"""Rows through the network for a view and a step; image guidance of 1 drops a branch."""
-
-
-@pytest.mark.parametrize(("views", "names"), [(1, {"source"}), (3, {"source", "yaw015", "yaw030"})])
-def test_a_budget_of_network_rows_ends_a_method_after_so_many_views(folder, tmp_path, views, names):
-    own = {
-        "method": "by_view",
-        "options": {"steps": 1, "iterations": 3, "batch": 1},
-        "budget": {"network_rows": ROWS * views + 1},
-    }
-    record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
-    assert record.extra.budget == Spent(None, None, ROWS * views + 1, "network_rows")
-    assert record.extra.edited == views
-    assert set(record.extra.answers["edit"]) == names
-    assert record.cost.counters["network_rows"] == ROWS * views
-    assert probe("editing").repeatable(record)
-    # Of the source alone there is no Edit PSNR; NaN equals nothing, so the texts are compared.
-    assert math.isnan(record.extra.edit_psnr) == (views == 1)
-    assert repr(EditResult.from_json(record.extra.to_json()["edit"])) == repr(record.extra)
-
-
-def test_a_method_that_finishes_says_so_and_a_record_without_a_budget_has_no_word_of_one(
-    folder, tmp_path
-):
-    own = {"method": "by_view", "options": {"steps": 1, "iterations": 1}}
-    record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
-    assert "budget" not in record.extra.to_json()["edit"]
-    assert "budget" not in record.spec
-    own["budget"] = {"network_rows": 1000}
-    whole = record_of(folder, tmp_path, editing={}, variants={"planned": own})
-    assert whole.extra.budget.cut is None
-    assert [v.metrics for v in whole.views] == [
-        pytest.approx(v.metrics, nan_ok=True) for v in record.views
-    ]
-
-
-def sleeping(seconds):
-    """A method whose own work takes a planned time."""
-
-    def run(job):
-        return dataclasses.replace(planned(["red"] * 4).run(job), seconds={"edit": seconds})
-
-    return Method(EDITING_METHODS["attention_warping"].settings, run)
-
-
-def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_did_not_finish(
-    folder, tmp_path, monkeypatch
-):
-    given, times = [], iter([9.0, 2.5])
-
-    def cut_short(job):
-        given.append(job.budget)
-        edited = planned(["red"] * 4).run(job)
-        counters = {"iterations": 0, "network_rows": 8, "views": 4}
-        return dataclasses.replace(edited, cut="seconds", counters=counters)
-
-    # The first run in a process pays for compilation, and is not taken.
-    monkeypatch.setitem(EDITING_METHODS, "true pictures", Method(
-        EDITING_METHODS["attention_warping"].settings, lambda job: sleeping(next(times)).run(job)))  # fmt: skip
-    monkeypatch.setitem(
-        EDITING_METHODS,
-        "slow",
-        Method(EDITING_METHODS["attention_warping"].settings, cut_short, takes_budget=True),
-    )
-    monkeypatch.setattr(measure, "STOPWATCH", Stopwatch())
-    study = load(
-        folder,
-        variants={
-            "reference": {"method": "true pictures"},
-            "equal time": {"method": "slow", "budget": {"seconds_of": "reference"}},
-        },
-        probes={"editing": ["equal time", "reference"]},
-    )
-    store = Store(tmp_path / "run")
-    planned_run = plan(study, store)
-    # The reference's own cell comes last, and runs a third time.
-    times = itertools.chain(times, iter([7.0]))
-    assert execute(planned_run, store).complete
-    assert given == [Budget(2.5, None)]
-    cell = next(c for c in planned_run.cells if c.variant == "equal time")
-    record = store.read_as(cell.id, probe("editing").read)
-    assert record.extra.budget == Spent(2.5, "reference", None, "seconds")
-    assert not probe("editing").repeatable(record)
-    measured = {cell.variants: cell for cell in read_snapshot(store).cells}
-    assert not measured["equal time",].figures and not measured["equal time",].counters
-    assert measured["reference",].counters
-    write_report(store)
-    report = (store.root / "report.md").read_text()
-    assert "**Did not finish: equal time (1 of 1, by seconds).**" in report
-    assert "before the edit: equal time (1 of 1)" in report
-    rows = [json.loads(line) for line in (store.root / "results.jsonl").read_text().splitlines()]
-    assert {row["variant"] for row in rows if row.get("repeatable") is False} == {"equal time"}
-
-
-def test_a_variant_is_the_same_cell_with_or_without_another_ones_budget(folder):
-    variants = {"a": {"method": "by_view"}, "b": {"method": "by_view", "budget": {"seconds_of": "a"}},
-                "c": {"method": "by_view", "budget": {"seconds": 2}}}  # fmt: skip
-    alone = load(folder, editing={}, variants={"a": variants["a"]}, probes={"editing": ["a"]})
-    study = load(folder, editing={}, variants=variants, probes={"editing": ["a", "b", "c"]})
-    scenes = {name: load_scene(name) for name in study.scenes}
-    (first,) = (c for c in cells_of(alone, scenes) if c.probe == "editing")
-    cells = {c.variant: c for c in cells_of(study, scenes) if c.probe == "editing"}
-    assert cells["a"].id == first.id
-    assert len({cell.id for cell in cells.values()}) == 3
-
-
 def test_the_study_that_compares_methods_tunes_attention_warping_alike():
     """Oracle: stages counted by hand."""
     study = load_study("comparison")
@@ -482,25 +368,6 @@ def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
         (
             {"editing": {"editor": {"name": "no-such"}}, "variants": {"planned": {}}},
             "editor 'no-such'",
-        ),
-        (
-            {"variants": {"planned": {"method": "true pictures", "budget": {"seconds": 9}}}},
-            "'true pictures' runs to its end",
-        ),
-        ({"variants": {"planned": {"method": "dge", "budget": {}}}}, "got no limit"),
-        (
-            {
-                "editing": {},
-                "variants": {"planned": {"method": "dge", "budget": {"seconds_of": "other"}}},
-            },
-            "no variant 'other'",
-        ),
-        (
-            {
-                "editing": {},
-                "variants": {"planned": {"method": "dge", "budget": {"seconds_of": "planned"}}},
-            },
-            "has seconds_of itself",
         ),
     ],
 )

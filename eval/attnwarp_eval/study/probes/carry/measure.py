@@ -69,7 +69,6 @@ class CarryProbe(MethodProbe[NoExtra]):
 
     name = "carry"
     protocol = 2
-    whole = True
     study_part = StudyPart
     metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
 

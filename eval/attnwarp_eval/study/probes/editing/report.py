@@ -1,15 +1,15 @@
-"""Report of edited scenes: the source edits, the editor's abilities, budgets, and pictures."""
+"""Report of edited scenes: the source edits, the editor's abilities, and pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from statistics import median
 from typing import Any, ClassVar
 
 from attnwarp_eval.document.model import Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import interval, over_scenes
+from attnwarp_eval.statistics.intervals import over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
     ProbeReport,
@@ -64,7 +64,7 @@ class EditingReport(ProbeReport):
     )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """Sections on the source edits, the editor's abilities, and budgets."""
+        """Sections on the source edits and the editor's abilities."""
         if not results.finished(self.name):
             return
         yield source_edits(results, self.name)
@@ -74,8 +74,6 @@ class EditingReport(ProbeReport):
             yield published(results, self.name)
             able.text.append(encoders_named(results.study, spec))
         yield able
-        if (section := budgets(results, self.name)) is not None:
-            yield section
 
     def gallery(self, results: Results) -> Section | None:
         """Edited views side by side."""
@@ -187,7 +185,7 @@ def _published(results: Results, probe: str, edit: str) -> Table:
 
 
 def controls(results: Results, probe: str) -> list[str]:
-    """Measured variants that edit each view alone without a budget; without any, the first measured
+    """Measured variants that edit each view alone; without any, the first measured
     variant.
     """
     measured = [
@@ -261,80 +259,3 @@ def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
         label = "truth" if len(truths) == 1 else f"truth: {', '.join(names)}"
         rows.append(row(label, files[names[0]], "truth"))
     return Grid(caption, heads, rows)
-
-
-def budgets(results: Results, probe: str) -> Section | None:
-    """Section on the use of budgets; None if no method has one."""
-    columns = [
-        "variant",
-        "budget, s",
-        "seconds of",
-        "network rows at most",
-        "cells cut short",
-        "taken, s",
-        "network rows",
-        "edited views",
-        "iterations of tuning",
-    ]
-    rows, cut, untuned = [], [], []
-    for name in results.study.variants:
-        cells = [
-            (scene, record)
-            for scene, _, record in results.records(probe, name)
-            if record.extra.budget
-        ]
-        if not cells:
-            continue
-        records = [record for _, record in cells]
-        spent = [record.extra.budget for record in records]
-        ended = [value.cut for value in spent if value.cut is not None]
-        if ended:
-            by = " and ".join(sorted({limit.replace("_", " ") for limit in ended}))
-            cut.append(f"{name} ({len(ended)} of {len(spent)}, by {by})")
-        idle = sum(record.cost.counters["iterations"] == 0 for record in records)
-        if idle:
-            untuned.append(f"{name} ({idle} of {len(spent)})")
-        rows.append(
-            [
-                name,
-                number(_limit(cells, "seconds")),
-                spent[0].seconds_of or "–",
-                number(_limit(cells, "network_rows")),
-                f"{len(ended)} of {len(spent)}",
-                number(_over_scenes((s, r.cost.seconds["whole"] or 0.0) for s, r in cells)),
-                number(_over_scenes((s, r.cost.counters["network_rows"]) for s, r in cells)),
-                number(_over_scenes((s, r.extra.edited) for s, r in cells)),
-                number(_over_scenes((s, r.cost.counters["iterations"]) for s, r in cells)),
-            ]
-        )
-    if not rows:
-        return None
-    text = [
-        (
-            "Means over scenes. Nothing begins beyond a budget, so a method may"
-            " take a little longer. **A budget in seconds makes a result depend on the machine and"
-            " on what else runs there; no comparison of two runs reads these figures.**"
-        ),
-        f"**Did not finish: {'; '.join(cut) or 'none'}.**",
-    ]
-    if untuned:
-        text.append(
-            "Ended before their first iteration of tuning, so that their renders show the scene"
-            f" before the edit: {'; '.join(untuned)}."
-        )
-    timed = (columns[1], columns[5])
-    return Section("Methods with a budget", text, [Table(columns, rows, timed=timed, folded=True)])
-
-
-def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
-    """Mean over scenes of one limit of the cells' budgets, NaN without limits."""
-    limits = [(scene, getattr(record.extra.budget, name)) for scene, record in cells]
-    return _over_scenes((scene, limit) for scene, limit in limits if limit is not None)
-
-
-def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
-    """Mean over scenes of the means over their cells, from (scene, value) pairs."""
-    by_scene: dict[str, list[float]] = {}
-    for scene, value in values:
-        by_scene.setdefault(scene, []).append(value)
-    return interval(by_scene).mean

@@ -19,7 +19,6 @@ from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared import pictures
-from attnwarp_eval.study.shared.budgets import Spent
 from attnwarp_eval.study.shared.edit_figures import EditFigures, full_size
 from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement, neighbours
 from attnwarp_eval.study.shared.editing_methods import EditedScene
@@ -42,7 +41,6 @@ class EditResult:
         overall: by "edit" and "render", the nearest answer to all views together.
         edit_psnr: dB, edited views against renders, pooled over pixels with a surface.
         injected: mean share of the targets' pixels with injected features; 0 without a warp.
-        budget: budget of the method, None without one.
     """
 
     name: str
@@ -54,7 +52,6 @@ class EditResult:
     edit_psnr: float
     edited: int
     injected: float
-    budget: Spent | None = None
 
     @property
     def comparable(self) -> bool:
@@ -63,10 +60,7 @@ class EditResult:
 
     def to_json(self) -> Json:
         """The record's entry ``edit``."""
-        data = dict(without_nan(asdict(self)))
-        if self.budget is None:
-            del data["budget"]
-        return {"edit": data}
+        return {"edit": dict(without_nan(asdict(self)))}
 
     @classmethod
     def from_json(cls, data: Json) -> EditResult:
@@ -80,8 +74,7 @@ class EditResult:
             for key in ("source", "alone")
         }
         own = with_nan({"edit_psnr": data["edit_psnr"]})
-        budget = {"budget": Spent(**data["budget"])} if data.get("budget") else {}
-        return cls(**{**data, **judgements, **own, **budget})
+        return cls(**{**data, **judgements, **own})
 
 
 class Measurement:
@@ -107,17 +100,14 @@ class Measurement:
         self.before, self.after, self.encoders = before, result.gaussians, encoders
         self.source = names[0]
         if not result.edited:
-            method = f"method {work.spec['method']!r}"
             raise StudyError(
-                f"{method} gave no edited view, expected at least one"
-                if result.cut is None
-                else f"budget: it ended {method} before its first edit; give more"
+                f"method {work.spec['method']!r} gave no edited view, expected at least one"
             )
         edited = {
             names[k]: full_size(truth.originals[names[k]], v) for k, v in result.edited.items()
         }
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
-        # A method cut short may have left the source unedited: it then shows no edit.
+        # A method may leave the source unedited: it then shows no edit.
         image = edited.get(self.source, truth.originals[self.source])
         self.judged = truth.judge({self.source: image})
         self.figures = {

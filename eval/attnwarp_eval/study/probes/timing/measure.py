@@ -76,14 +76,13 @@ class Timing(Probe[Rounds]):
     times_in_turn = (*OF_A_WARP, *OF_AN_EDIT)
 
     def check(self, study: Study) -> None:
-        """Require contestants that render and edit, without a time budget or the exact truth."""
+        """Require contestants that render and edit, without the exact truth."""
         check_splats(study, self.name, "time to take")
         for name in study.probes.get(self.name, []):
             own = study.variants[name].part(VariantPart)
             if name not in _edited(study):
                 continue
-            why = "has a budget, which may cut it short" if own.budget is not None else ""
-            why = "takes its mask from the scene's truth" if own.mask == "truth" else why
+            why = "takes its mask from the scene's truth" if own.mask == "truth" else ""
             if own.control == OTHER_SCENE:
                 why = "takes features of another scene, whose edit is no part of its own"
             why = "edits nothing" if own.method == "true pictures" else why
