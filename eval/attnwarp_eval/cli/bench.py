@@ -20,13 +20,21 @@ SMALL = 3
 
 @app.command()
 def export(
-    folder: Annotated[Path, typer.Argument(help="Folder; one begun earlier is continued.")],
-    scenes: Annotated[int, typer.Option(min=1, help="How many drawn scenes.")] = 12,
-    small: Annotated[bool, typer.Option("--small", help=f"{SMALL} scenes.")] = False,
-    size: Annotated[int, typer.Option(min=16, max=1024, help="Edge of the pictures in px.")] = 256,
-    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
-    targets: Annotated[int, typer.Option(min=1, max=15, help="Views beside the source.")] = 15,
-    seed: Annotated[int, typer.Option(min=0, help="Of the drawn scenes.")] = 0,
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of the bench; one begun earlier is continued.")
+    ],
+    scenes: Annotated[int, typer.Option(min=1, help="Draw so many scenes.")] = 12,
+    small: Annotated[
+        bool, typer.Option("--small", help=f"Draw {SMALL} scenes, for a trial.")
+    ] = False,
+    size: Annotated[
+        int, typer.Option(min=16, max=1024, help="Render pictures of so many px a side.")
+    ] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Render with so many samples a pixel.")] = 16,
+    targets: Annotated[
+        int, typer.Option(min=1, max=15, help="Write so many views beside the source.")
+    ] = 15,
+    seed: Annotated[int, typer.Option(min=0, help="Draw the scenes by this seed.")] = 0,
 ) -> None:
     """Write scenes with pictures, cameras, depth, masks, splats, instructions, and their truth."""
     with clear_errors(), reporter(title=folder.name) as report:
@@ -43,16 +51,28 @@ def export(
 @app.command()
 def run(
     folder: Annotated[Path, typer.Argument(help="The exported bench.")],
-    out: Annotated[Path, typer.Argument(help="Folder to hand in; one begun is continued.")],
+    out: Annotated[Path, typer.Argument(help="Folder to hand in; one begun earlier is continued.")],
     method: Annotated[
-        str, typer.Option(help="Method of this package or of a plugin; warp needs no editor.")
+        str,
+        typer.Option(help="Edit by this method, of the package or a plugin; warp needs no editor."),
     ] = "attention_warping",
     editor: Annotated[
-        str, typer.Option(help="Bundled editor, a folder in diffusers' format, or ideal.")
+        str,
+        typer.Option(
+            help="Edit with this bundled editor, a folder in diffusers' format, or ideal."
+        ),
     ] = "small-plain",
-    seed: Annotated[int, typer.Option(min=0, help="Of the first scene's noise.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Draw the first scene's noise by this seed, the others' by later ones."
+        ),
+    ] = 0,
     changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method.")
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Change a setting of the method; may be repeated."
+        ),
     ] = None,
 ) -> None:
     """Edit the scenes by a method of ours, or of a plugin, with an editor of ours, or warp them."""
@@ -74,9 +94,9 @@ def score(
     edited: Annotated[
         Path, typer.Argument(help="Folder with SCENE/EDIT/VIEW.png, or warps as SCENE/VIEW.npz.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for bench-score.json and its page.")] = Path(
-        "runs/bench"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Write bench-score.json and its page to this folder.")
+    ] = Path("runs/bench"),
 ) -> None:
     """Score edited pictures of a bench, or warps, against its truth, which is made again."""
     from rich.console import Console
@@ -99,7 +119,7 @@ def table(
     results: Annotated[
         list[Path], typer.Argument(help="bench-score.json of each method; the first is paired.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for bench.md and its page.")] = Path(
+    out: Annotated[Path, typer.Option(help="Write bench.md and its page to this folder.")] = Path(
         "runs/bench"
     ),
 ) -> None:

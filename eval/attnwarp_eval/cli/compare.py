@@ -37,22 +37,24 @@ def compare(
     ],
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
     markdown: Annotated[
-        Path | None, option("Write the comparison here, for the summary of a CI.")
+        Path | None, option("Write the comparison to this file as Markdown, for a CI.", "FILE")
     ] = None,
-    json: Annotated[Path | None, option("Write every verdict here, for a program.")] = None,
+    json: Annotated[
+        Path | None, option("Write every verdict to this file as JSON, for a program.", "FILE")
+    ] = None,
     html: Annotated[
-        Path | None, option("Write a page here, with pictures before and after of what changed.")
+        Path | None, option("Write a page to this file, with pictures before and after.", "FILE")
     ] = None,
     common: Annotated[
         bool,
         option(
-            "Compare what both have; exit code 3 if something is left out. Not for a gate.",
+            "Compare what both have; exit code 3 if anything is left out. Not for a gate.",
             None,
             "--common",
         ),
     ] = False,
     update: Annotated[
-        bool, option("Rewrite the baseline's file from the run.", None, "--update")
+        bool, option("Accept the run: write the baseline's file from it.", None, "--update")
     ] = False,
 ) -> None:
     """Did my change make anything worse?

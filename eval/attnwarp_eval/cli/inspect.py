@@ -30,43 +30,72 @@ def inspect(
         Path | None, option("Cameras of your own scene: transforms.json, its folder, or COLMAP's.")
     ] = None,
     ply: Annotated[
-        Path | None, option("Splats before the edit, as given to attnwarp edit.")
+        Path | None, option("Read the splats before the edit, as given to attnwarp edit.", "FILE")
     ] = None,
-    images: Annotated[Path | None, option("Pictures of a COLMAP model.")] = None,
+    images: Annotated[
+        Path | None, option("Read the pictures of a COLMAP model from this folder.", "FOLDER")
+    ] = None,
     source: Annotated[
-        str | None, option("Source view of your own scene; the first if left out.")
+        str | None, option("Warp from this view of your own scene (default: the first).", "VIEW")
     ] = None,
-    scene: Annotated[str | None, option("Of a run; its first if left out.")] = None,
-    seed: Annotated[int | None, option("Of a run; its first if left out.")] = None,
+    scene: Annotated[
+        str | None, option("Show this scene of a run (default: its first).", "NAME")
+    ] = None,
+    seed: Annotated[
+        int | None, option("Show this seed of a run (default: its first).", "N")
+    ] = None,
     variant: Annotated[
-        str | None, option("Of the run, or a preset; corrected if left out.")
+        str | None,
+        option("Warp by this variant of the run, or by a preset (default: corrected).", "NAME"),
     ] = None,
     view: Annotated[
-        str | None, option("Target view, or EDIT/VIEW of a run of edits; the first if left out.")
+        str | None,
+        option("Warp to this view, EDIT/VIEW in a run of edits (default: the first).", "VIEW"),
     ] = None,
-    pixel: Annotated[str | None, option("Target pixel COLUMN,ROW to explain.")] = None,
+    pixel: Annotated[
+        str | None,
+        option("Explain the numbers of this pixel of the target, such as 120,84.", "COLUMN,ROW"),
+    ] = None,
     layer: Annotated[
-        str | None, option("Feature grid, such as 64x64; --pixel then picks its cell.")
+        str | None,
+        option("Show this feature grid, such as 64x64; --pixel then names its cell.", "WxH"),
     ] = None,
-    step: Annotated[str | None, option("Of an edit: before, 'stage 1', ..., edited.")] = None,
+    step: Annotated[
+        str | None, option("Show this step of an edit: before, 'stage 1', ..., or edited.", "STEP")
+    ] = None,
     color: Annotated[
         str,
         option(
-            "picture, mask, rules, incidence; with truth: endpoint error, depth error,"
-            " covered by; of an edit: edit disagreement."
+            "Colour the surface by picture, mask, rules or incidence; with truth by endpoint error,"
+            " depth error or covered by; in an edit by edit disagreement."
         ),
     ] = "mask",
-    splats: Annotated[bool, option("Draw the splats as discs.")] = False,
-    size: Annotated[int | None, option("Image size in px.", min=16, max=4096)] = None,
-    screenshot: Annotated[Path | None, option("Write a PNG instead of opening a window.")] = None,
-    export: Annotated[
-        Path | None, option("Write .html, .glb or .vtp instead of opening a window.")
+    splats: Annotated[bool, option("Draw the splats as discs, beside the surface.")] = False,
+    size: Annotated[
+        int | None,
+        option(
+            "Render views of so many px a side (default: the run's, else 512).",
+            "PX",
+            min=16,
+            max=4096,
+        ),
     ] = None,
-    web: Annotated[bool, option("Serve the window to a browser.", None, "--web")] = False,
+    screenshot: Annotated[
+        Path | None, option("Write this picture (.png) in place of opening a window.", "FILE")
+    ] = None,
+    export: Annotated[
+        Path | None,
+        option("Write this file (.html, .glb, .vtp) in place of opening a window.", "FILE"),
+    ] = None,
+    web: Annotated[
+        bool, option("Serve the window to a browser; Ctrl-C ends it.", None, "--web")
+    ] = False,
     host: Annotated[
-        str, option("Address for --web; 0.0.0.0 lets other machines in.")
+        str, option("Serve --web at this address; 0.0.0.0 lets other machines in.", "ADDRESS")
     ] = "127.0.0.1",
-    port: Annotated[int, option("Port for --web; 0: a free one.", min=0, max=65535)] = 0,
+    port: Annotated[
+        int, option("Serve --web at this port; 0 takes a free one.", "N", min=0, max=65535)
+    ] = 0,
 ) -> None:
     """Open a warp in 3D: surface, cameras, mask against truth, and a pixel's numbers."""
     with clear_errors(), _quick_start():

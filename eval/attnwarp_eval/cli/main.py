@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -37,26 +38,34 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-COMMANDS: dict[str, Any] = {
-    "run": run.run,
-    "report": run.report,
-    "verdicts": run.verdicts,
-    "verify": run.verify,
-    "studies": run.studies,
-    "captures": None,
-    "compare": compare.compare,
-    "stability": stability.stability,
-    "metrics": metrics.metrics,
-    "tracks": tracks.tracks,
-    "bench": bench.app,
-    "encoders": metrics.encoders,
-    "inspect": inspect.inspect,
-    "doctor": doctor.doctor,
-    "scenes": scenes.app,
-    "userstudy": None,
-    "cache": cache.app,
+STUDIES, PICTURES, MACHINE = (
+    "Studies and claims",
+    "Your pictures and captures",
+    "Scenes and machine",
+)
+"""Panels of the help below the commands that most people call."""
+
+COMMANDS: dict[str, tuple[str | None, Any]] = {
+    "run": (None, run.run),
+    "report": (None, run.report),
+    "compare": (None, compare.compare),
+    "bench": (None, bench.app),
+    "inspect": (None, inspect.inspect),
+    "studies": (STUDIES, run.studies),
+    "verify": (STUDIES, run.verify),
+    "verdicts": (STUDIES, run.verdicts),
+    "stability": (STUDIES, stability.stability),
+    "metrics": (PICTURES, metrics.metrics),
+    "encoders": (PICTURES, metrics.encoders),
+    "tracks": (PICTURES, tracks.tracks),
+    "captures": (PICTURES, None),
+    "userstudy": (PICTURES, None),
+    "scenes": (MACHINE, scenes.app),
+    "doctor": (MACHINE, doctor.doctor),
+    "cache": (MACHINE, cache.app),
 }
-"""Commands in the order of ``--help``; None marks the position of a laboratory command."""
+"""Panel and command by name, in the order of ``--help``; None marks the place of a laboratory
+command."""
 
 GROUP = "attnwarp_eval.commands"
 """Group of entry points: each names a dictionary of commands by name, typer's apps or functions."""
@@ -78,15 +87,32 @@ def plugin_commands() -> dict[str, Any]:
 
 
 app.callback()(program_options)
-for command_name, command in (COMMANDS | plugin_commands()).items():
+commands = {name: command for name, (_, command) in COMMANDS.items()} | plugin_commands()
+for command_name, command in commands.items():
+    panel = COMMANDS.get(command_name, (None,))[0]
     if isinstance(command, typer.Typer):
-        app.add_typer(command, name=command_name)
+        app.add_typer(command, name=command_name, rich_help_panel=panel)
     elif command is not None:
-        app.command(command_name)(command)
+        app.command(command_name, rich_help_panel=panel)(command)
+
+
+FIRST = """\
+attnwarp-eval measures warps, masks and edits of Gaussian scenes against exact truth.
+Where to begin:
+
+  attnwarp-eval run quick --scenes spheres           an ablation of one scene, with a report
+  attnwarp-eval inspect spheres                      a warp in 3D, with a pixel's numbers on a click
+  attnwarp-eval metrics --edited E --originals O     scores of edited pictures of your own
+  attnwarp-eval compare BASELINE runs/quick          did a change make anything worse? exit code 1
+
+attnwarp-eval studies and scenes list say what ships, --help what the commands are."""
 
 
 def main(name: str = "attnwarp-eval") -> None:
-    """Entry point of the console script."""
+    """Entry point of the console script; without a command, what a newcomer does first."""
+    if len(sys.argv) == 1:
+        typer.echo(FIRST)
+        return
     shell.run(app, name)
 
 

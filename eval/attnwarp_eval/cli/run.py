@@ -31,32 +31,48 @@ if TYPE_CHECKING:
 
 def run(
     study: Annotated[
-        str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")
+        str, typer.Argument(help="Study that ships, such as quick, or the path of a study's YAML.")
     ] = "quick",
-    out: Annotated[Path | None, option("The run's folder; runs/<study> if left out.")] = None,
+    out: Annotated[
+        Path | None,
+        option(
+            "Write the run to this folder, or go on with the run in it (default runs/STUDY).",
+            "FOLDER",
+        ),
+    ] = None,
     jobs: Annotated[
-        int, option("Worker processes, at most one a core.", None, "--jobs", "-j", min=1)
+        int, option("Compute in so many processes, at most one a core.", "N", "--jobs", "-j", min=1)
     ] = 1,
     scheduler: Annotated[
         str | None,
         option(
-            "A dask scheduler, tcp://HOST:PORT or its file, whose workers compute.", "ADDRESS|FILE"
+            "Compute on the workers of this dask scheduler, tcp://HOST:PORT or its file.",
+            "ADDRESS|FILE",
         ),
     ] = None,
     scenes: Annotated[
-        str | None, option("Only these scenes (comma-separated names or paths).")
+        str | None,
+        option("Measure these scenes alone, with commas between names or paths.", "NAMES"),
     ] = None,
     seeds: Annotated[
-        str | None, option("Only these seeds (comma-separated whole numbers).")
+        str | None, option("Take these seeds in place of the study's, such as 0,1,2.", "SEEDS")
     ] = None,
     size: Annotated[
-        int | None, option("Image size in px, not the study's.", min=16, max=4096)
+        int | None,
+        option(
+            "Render pictures of so many px a side in place of the study's.", "PX", min=16, max=4096
+        ),
     ] = None,
     keep_going: Annotated[
-        bool, option("After a failed cell.", None, "--keep-going/--fail-fast")
+        bool, option("Go on after a failed cell, or stop at it.", None, "--keep-going/--fail-fast")
     ] = True,
     dry_run: Annotated[
-        bool, option("Count what would be measured, and plan the rest.", None, "--dry-run")
+        bool,
+        option(
+            "Measure nothing; list the cells, and the hours and scenes they need.",
+            None,
+            "--dry-run",
+        ),
     ] = False,
 ) -> None:
     """Run a study and write its report.
@@ -293,18 +309,22 @@ def report(
     run: Annotated[
         Path, typer.Argument(help="The run's folder, or one of raw results (results*.jsonl.xz).")
     ],
-    timings: Annotated[bool, option("Without: no seconds, to compare runs.")] = True,
-    pictures: Annotated[bool, option("Without: tables and figures alone.")] = True,
+    timings: Annotated[
+        bool, option("Show seconds; two reports without any can be compared.")
+    ] = True,
+    pictures: Annotated[bool, option("Show pictures beside tables and figures.")] = True,
     long: Annotated[
-        bool, option("Every table in report.md, not one page of them.", None, "--long")
+        bool, option("Write every table to report.md in place of one page.", None, "--long")
     ] = False,
     out: Annotated[
-        Path | None, option("Folder of the report, without pictures of views; by default RUN.")
+        Path | None,
+        option("Write the report here, without pictures of views (default RUN).", "FOLDER"),
     ] = None,
     raw: Annotated[
         Path | None,
         option(
-            "Write the raw results here too, compressed, for attnwarp-eval verdicts.", "FOLDER|FILE"
+            "Write the compressed raw results here too, which verdicts and compare read.",
+            "FOLDER|FILE",
         ),
     ] = None,
 ) -> None:
@@ -355,7 +375,7 @@ def verdicts(
     ] = Path("reports"),
     write: Annotated[
         list[Path] | None,
-        option("Document whose marked table and lines are made anew; may be repeated."),
+        option("Write the table and lines anew in this document; may be repeated.", "FILE"),
     ] = None,
 ) -> None:
     """Judge every claim by the raw results of its study, all adjusted together.

@@ -8,7 +8,9 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import typer
 from further import further
+from typer.core import TyperOption
 
 from attnwarp.cli.shell import file_error
 from attnwarp_eval.cli import main
@@ -66,6 +68,23 @@ main()
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=200
     )
     assert (done.returncode, done.stderr) == (130, line)
+
+
+def test_without_a_command_a_newcomer_reads_what_to_do_first():
+    done = subprocess.run([*PRINTS[:3]], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.count("\n") <= 10
+    lines = [line.split() for line in done.stdout.splitlines() if line.startswith("  ")]
+    assert [line[1] for line in lines] == ["run", "inspect", "metrics", "compare"]
+
+
+@pytest.mark.parametrize("name", ["run", "report", "compare", "inspect", "bench run"])
+def test_each_options_help_is_a_sentence(name):
+    command = typer.main.get_command(main.app)
+    for part in name.split():
+        command = command.commands[part]
+    texts = {p.name: p.help for p in command.params if isinstance(p, TyperOption)}
+    for option, text in texts.items():
+        assert text[0].isupper() and text.endswith(".") and len(text.split()) > 3, option
 
 
 def test_output_to_a_full_disk_is_one_line_and_exit_code_2():
