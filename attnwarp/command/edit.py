@@ -53,6 +53,7 @@ from attnwarp.io import THIRD_SCALE, Dataset, write_ply
 from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, MethodSettings, Result
+from attnwarp.methods.algorithms.attention_warping import check_editor
 from attnwarp.methods.attention_settings import AttentionWarpingSettings
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.by_warps import SourceSettings
@@ -60,7 +61,6 @@ from attnwarp.methods.change import say_drift, say_little
 from attnwarp.methods.features import Features
 from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.tuning import perceptual_net
-from attnwarp.methods.view_edits import check_editor
 from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
 from attnwarp.warp import piece_around

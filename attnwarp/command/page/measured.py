@@ -18,7 +18,7 @@ from attnwarp.fit import Views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_ply
 from attnwarp.io.names import file_stems
-from attnwarp.methods.algorithms.attention_warping import AttentionWarping
+from attnwarp.methods.algorithms.attention_warping import AttentionWarping, RecordedSource
 from attnwarp.methods.algorithms.by_view import ByView, ByViewSettings
 from attnwarp.methods.algorithms.dge import DGE
 from attnwarp.methods.algorithms.gaussctrl import GaussCtrl
@@ -29,7 +29,6 @@ from attnwarp.methods.pictures import Bytes, Segment, to_bytes
 from attnwarp.methods.scene import near_of
 from attnwarp.methods.settings import PRESETS
 from attnwarp.methods.tuning import Order
-from attnwarp.methods.view_edits import RecordedSource
 from attnwarp.methods.work import Work
 from attnwarp.reporting import Reporter
 from attnwarp.warp import preset, render_surface, sample_at, warp_surfaces
@@ -88,7 +87,7 @@ def edited_alone(
     if name == "attention_warping":
         method = AttentionWarping(work, settings, names.index(source), None, None, "cpu")
         edited = folder.read_picture(f"views/{source}.png").astype(np.float32) / np.float32(255)
-        method.views.keep(RecordedSource(edited, None))
+        method.keep(RecordedSource(edited, None))
     elif name == "guided":
         first = manifest["rounds"][0]["views"][0]
         method = Guided(work, settings, names.index(first), None)

@@ -32,10 +32,10 @@ from attnwarp.errors import InputError
 from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods import METHODS, Budget, preset
+from attnwarp.methods.algorithms.attention_warping import check_editor
 from attnwarp.methods.base import workdir_of
 from attnwarp.methods.pictures import enlarged_change, to_bytes
 from attnwarp.methods.scene import near_of, render_picture
-from attnwarp.methods.view_edits import check_editor
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST
 from attnwarp_eval.canonical_json import without_nan

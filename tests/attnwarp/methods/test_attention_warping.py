@@ -235,12 +235,10 @@ def blended(own, source, xy, a):
 
 
 def test_one_step_is_the_written_out_injection_in_float64(editor, monkeypatch):
-    from attnwarp.methods import view_edits
+    from attnwarp.methods.algorithms import attention_warping as algorithm
 
     edits = []
-    monkeypatch.setattr(
-        view_edits, "edit", lambda *a, **k: edits.append(edit(*a, **k)) or edits[-1]
-    )
+    monkeypatch.setattr(algorithm, "edit", lambda *a, **k: edits.append(edit(*a, **k)) or edits[-1])
     model, views = wall(), cameras(2)
     random = np.random.default_rng(0)
     images = [random.random((32, 32, 3)).astype(np.float32) for _ in views]
@@ -700,7 +698,7 @@ def test_no_two_seeds_and_views_have_the_same_fresh_noise_nor_the_shared_one_of_
 
 
 def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
-    from attnwarp.methods.view_edits import check_editor
+    from attnwarp.methods.algorithms.attention_warping import check_editor
 
     drawn = {
         check_editor(editor, replace(QUICK, start=(700, 980), seed=seed)) for seed in range(50)
@@ -738,7 +736,7 @@ def test_depth_of_the_frozen_model_does_not_follow_the_tuning(scene, editor, tmp
     last = [Path(scene[1][view].name).stem for view in plan(still).stages[1]]
 
     def pictures_of(name):
-        return [(tmp_path / name / "features" / f"{view}.png").read_bytes() for view in last]
+        return [(tmp_path / name / "views" / f"{view}.png").read_bytes() for view in last]
 
     run(scene, editor, tmp_path / "frozen", rough)
     run(scene, editor, tmp_path / "current", replace(rough, depth_from="current"))
@@ -889,17 +887,17 @@ def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_gui
 def test_latents_by_stage_are_random_first_and_the_renders_own_later(
     scene, depth_editor, monkeypatch
 ):
-    from attnwarp.methods import view_edits
+    from attnwarp.methods.algorithms import attention_warping as algorithm
 
     model, views, _ = scene
     inverted, prompts = [], []
-    invert, task = view_edits.invert_view, depth_editor.task
+    invert, task = algorithm.invert_view, depth_editor.task
 
     def noted(editor, guide, picture, prompt, **more):
         inverted.append(picture)
         return invert(editor, guide, picture, prompt, **more)
 
-    monkeypatch.setattr(view_edits, "invert_view", noted)
+    monkeypatch.setattr(algorithm, "invert_view", noted)
     monkeypatch.setattr(
         depth_editor,
         "task",
@@ -930,13 +928,13 @@ def test_an_editor_without_a_negative_prompt_is_refused_one(scene, editor):
 def test_the_released_start_noises_the_original_first_and_the_render_later(
     scene, editor, monkeypatch
 ):
-    from attnwarp.methods import view_edits
+    from attnwarp.methods.algorithms import attention_warping as algorithm
 
     model, views, images = scene
     noised = []
-    one = view_edits.edit
+    one = algorithm.edit
     monkeypatch.setattr(
-        view_edits, "edit", lambda *a, **k: noised.extend(k["pictures"]) or one(*a, **k)
+        algorithm, "edit", lambda *a, **k: noised.extend(k["pictures"]) or one(*a, **k)
     )
     settings = quick("released", color_rate=40.0)
     result = run(scene, editor, settings=settings)

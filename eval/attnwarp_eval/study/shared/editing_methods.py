@@ -182,10 +182,10 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
 
         def edit_source(self, *rest: Any) -> list[ViewEdit]:
             edits = super().edit_source(*rest)
-            own = self.views.recorded
+            own = self.recorded
             if own.recording is not None:
                 recordings.append(own.recording)
-                self.views.keep(replace(own, recording=recordings[0]))
+                self.keep(replace(own, recording=recordings[0]))
             return edits
 
     settings = AttentionWarpingSettings.from_dict(job.settings)
