@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib.metadata import entry_points
 from typing import Any
@@ -110,7 +111,8 @@ attnwarp-eval studies and scenes list say what ships, --help what the commands a
 
 def main(name: str = "attnwarp-eval") -> None:
     """Entry point of the console script; without a command, what a newcomer does first."""
-    if len(sys.argv) == 1:
+    completes = any(name.endswith("_COMPLETE") for name in os.environ)  # a shell asks for names
+    if len(sys.argv) == 1 and not completes:
         typer.echo(FIRST)
         return
     shell.run(app, name)

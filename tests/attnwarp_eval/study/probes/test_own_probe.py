@@ -29,7 +29,7 @@ STUDY = {
     "views": [f"yaw{yaw:03d}" for yaw in YAWS],
     "spp": 1,
     "camera_unit": 2.0,
-    "variants": {"plain": {}, "same": {"set": {"in_front": False}}, "double": {"stretch": 2.0}},
+    "variants": {"plain": {}, "same": {}, "double": {"stretch": 2.0}},
     "probes": {"chord": ["plain", "same", "double"]},
     "ablations": [
         {"title": "Stretch", "probe": "chord", "baseline": "plain", "variants": ["double"]}

@@ -1,9 +1,5 @@
 """Variants on fitted splats. Oracle: the run's own file of splats, rendered by the float64 definition."""
 
-import fcntl
-import threading
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -18,7 +14,6 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, cells_of, load_study, parse_study
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.run import execute, plan
-from attnwarp_eval.study.shared import fits
 from attnwarp_eval.study.study import parse_variant
 from attnwarp_eval.world import world
 
@@ -77,24 +72,6 @@ def test_probes_share_one_fit_and_its_depth_is_what_they_measure(folder):
         both = truth.valid & (depth > 0) & np.isfinite(depth)
         error = np.mean(np.abs(depth - truth.depth)[both] / truth.depth[both])
         assert view["metrics"]["depth.abs_rel"] == pytest.approx(error, rel=1e-3)
-
-
-def test_a_fit_waits_for_the_process_that_is_at_it(tmp_path, monkeypatch):
-    begun = threading.Event()
-    monkeypatch.setattr(fits.fitted, "fit_scene", lambda *given, **options: begun.set())
-    spec = {"fit": {**FIT, "noise": 0.5}, "scene": "a" * 64, "size": 16, "spp": 1, "seed": 0}
-    work = SimpleNamespace(
-        spec=spec, root=tmp_path, world=SimpleNamespace(scene=None, geometry=None)
-    )
-    folder = fits.folder_of(tmp_path, spec)
-    folder.mkdir(parents=True)
-    with (folder / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        other = threading.Thread(target=fits.fit_of, args=(work,))
-        other.start()
-        assert not begun.wait(0.1)
-    other.join(timeout=60)
-    assert begun.is_set()
 
 
 def test_a_variant_takes_its_own_kind_of_fit_and_none_where_it_does_not_say_fitted(folder):
