@@ -11,6 +11,7 @@ from attnwarp.errors import EXTRAS, InputError, MissingExtraError, missing_extra
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {
+    "open3d-cpu": "open3d",
     "pyyaml": "yaml",
     "scikit-image": "skimage",
     "trame-vtk": "trame_vtk",
@@ -18,7 +19,7 @@ PACKAGES = {
     "warp-lang": "warp",
 }
 """Names on the package index that differ from the module's."""
-BROUGHT_ALONG = {"dask": "distributed", "drjit": "mitsuba", "markupsafe": "jinja2"}
+BROUGHT_ALONG = {"drjit": "mitsuba"}
 """Modules that come with another package of the extra."""
 NOT_IMPORTED_ALONE = {"libusb-package"}
 """Open3D works without it where the machine has libusb, so its absence is no error."""
