@@ -34,8 +34,8 @@ EXTRAS = {
     ),
     "eval": Extra(
         (
-            "dask", "distributed", "drjit", "jinja2", "markupsafe", "matplotlib", "mitsuba",
-            "mpmath", "open3d", "pydantic", "skimage", "yaml",
+            "dask", "distributed", "drjit", "jinja2", "mapbox_earcut", "markupsafe", "matplotlib",
+            "mitsuba", "mpmath", "open3d", "pydantic", "skimage", "yaml",
         ),
         "nothing of attnwarp-eval runs",
     ),
@@ -47,6 +47,7 @@ EXTRAS = {
         ("accelerate", "warp"),
         "splats are rendered on the processor, and --low-memory is refused",
     ),
+    "formats": Extra(("gaussforge",), "no splats of SPZ, SOG, KSPLAT and compressed PLY"),
     "colmap": Extra(("pycolmap",), "no poses of photographs, no tracks, no figures by COLMAP"),
 }  # fmt: skip
 """All extras, by their names in pyproject.toml."""

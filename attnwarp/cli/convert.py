@@ -25,7 +25,10 @@ FORMATS = (".ply", ".splat")
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="IN", help="Splats to convert: a .ply or .splat file.")
+        Path,
+        typer.Argument(
+            metavar="IN", help="Splats to convert: a .ply, .splat, .spz, .sog or .ksplat file."
+        ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write, .ply or .splat.")],
     kind: SplatKindOption = None,
@@ -81,12 +84,13 @@ def convert(
 
 def _check_start(path: Path) -> None:
     """Refuse a file without a PLY header, before the seconds of torch's import."""
-    if path.suffix.lower() == ".splat" or not path.is_file():
+    if path.suffix.lower() in (".splat", ".spz", ".sog", ".ksplat") or not path.is_file():
         return
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
             raise ValueError(
-                f"{path}: not a PLY file, which begins with 'ply'; expected splats, .ply or .splat"
+                f"{path}: not a PLY file, which begins with 'ply'; expected splats: .ply, .splat,"
+                " .spz, .sog or .ksplat"
             )
 
 

@@ -150,7 +150,11 @@ def edit(
     ] = None,
     ply: Annotated[
         Path | None,
-        of_splats("Edit these splats (.ply, .splat); without any, they are fitted first.", "FILE"),
+        of_splats(
+            "Edit these splats (.ply, .splat, .spz, .sog, .ksplat); without any, they are fitted"
+            " first.",
+            "FILE",
+        ),
     ] = None,
     kind: Annotated[
         Kind | None,

@@ -71,7 +71,11 @@ def fit(
     ] = None,
     start: Annotated[
         Path | None,
-        option("Go on from these splats (.ply, .splat) in place of DATA's points.", "SPLATS"),
+        option(
+            "Go on from these splats (.ply, .splat, .spz, .sog, .ksplat) in place of DATA's"
+            " points.",
+            "SPLATS",
+        ),
     ] = None,
     iterations: Annotated[
         int | None, option("Fit for so many steps, one view each (default 7000).", "N", min=1)

@@ -17,7 +17,10 @@ from attnwarp.errors import install_command
 def inspect(
     context: typer.Context,
     splats: Annotated[
-        Path, typer.Argument(help="Splats (.ply, .splat), or a folder that attnwarp edit made.")
+        Path,
+        typer.Argument(
+            help="Splats (.ply, .splat, .spz, .sog, .ksplat), or a folder that attnwarp edit made."
+        ),
     ],
     data: DataArgument,
 ) -> None:

@@ -26,6 +26,7 @@ from attnwarp import check
 from attnwarp.errors import InputWarning
 from attnwarp.gaussians import LARGEST_FILTER, LEAST_FILTER, SCREEN_FILTER, Gaussians, Kind
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
+from attnwarp.io.packed import packed_format, turn, unpack
 from attnwarp.io.ply_elements import PlyError, parse_ply, write_vertices
 
 Array = npt.NDArray[np.float64]
@@ -77,7 +78,8 @@ def read_ply(
 ) -> Gaussians:
     """Read splats.
 
-    ASCII and binary PLY of either byte order are read; further properties and elements are ignored.
+    ASCII and binary PLY of either byte order are read, and with the extra ``formats`` compressed
+    PLY, SPZ, SOG and KSPLAT, which hold 3DGS alone; further properties and elements are ignored.
     The first applicable rule determines the kind:
 
     1. ``kind``, or a comment's kind (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``);
@@ -119,7 +121,13 @@ def read_ply(
     path = existing_file(path)
     if kind is not None:
         check.one_of(kind, ("2d", "3d"), "kind")
-    columns, comments = _read_vertices(path)
+    if packed := packed_format(path):
+        if kind == "2d":
+            raise FileFormatError(path, "holds 3DGS alone; leave kind='2d' (--kind 2dgs) out")
+        columns, comments = _read_packed(path, packed)
+        kind = "3d"
+    else:
+        columns, comments = _read_vertices(path)
     _refuse_other_formats(path, columns)
     header = _read_comments(path, comments)
     xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
@@ -359,10 +367,24 @@ def _names(stem: str, count: int) -> tuple[str, ...]:
     return tuple(f"{stem}_{i}" for i in range(count))
 
 
-def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
+def _read_packed(path: Path, packed: str) -> tuple[Columns, list[str]]:
+    """Read splats of another format as columns of a PLY."""
+    data, comments = unpack(path, packed)
+    columns, _ = _read_vertices(path, data)
+    if packed == "ksplat" and "f_rest_9" in columns:
+        raise FileFormatError(
+            path,
+            "has harmonics beyond degree 1, which programs order in different ways; export degree 1"
+            " at most, or SPZ",
+        )
+    return turn(columns) if packed == "spz" else columns, comments
+
+
+def _read_vertices(path: Path, data: Any = None) -> tuple[Columns, list[str]]:
     """Read the scalar columns of the element ``vertex``, and all header comments."""
-    with path.open("rb") as stream:
-        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    if data is None:
+        with path.open("rb") as stream:
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     try:
         elements, comments = parse_ply(data)
     except PlyError as error:
@@ -379,13 +401,6 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
 
 
 def _refuse_other_formats(path: Path, columns: Columns) -> None:
-    if "packed_position" in columns:
-        raise FileFormatError(
-            path,
-            "is a compressed PLY; convert it to a plain one first (for example with PlayCanvas"
-            " splat-transform)",
-            field="packed_position",
-        )
     if "x" in columns and not any(name in columns for name in ("opacity", "scale_0", "rot_0")):
         raise FileFormatError(
             path,

@@ -11,6 +11,7 @@ from attnwarp.errors import EXTRAS, InputError, MissingExtraError, missing_extra
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {
+    "mapbox-earcut": "mapbox_earcut",
     "open3d-cpu": "open3d",
     "pyyaml": "yaml",
     "scikit-image": "skimage",

@@ -271,7 +271,10 @@ def of_capture(
         from attnwarp.command.edit import FIT_FOLDER
 
         if not is_edit(path):
-            raise InputError(f"{path}: expected splats (.ply, .splat) or a folder of attnwarp edit")
+            raise InputError(
+                f"{path}: expected splats (.ply, .splat, .spz, .sog, .ksplat) or a folder of"
+                " attnwarp edit"
+            )
         edit = read_edit(path, file_stems(dataset.cameras))
         source = source or edit.source
         variants = {EDIT_VARIANT: (Variant(preset="corrected"), None), **variants}

@@ -560,8 +560,6 @@ def test_folders_and_absent_files_and_other_formats_say_so(tmp_path):
     refused(tmp_path, "folder")
     write_points(tmp_path / "p.ply", np.zeros((2, 3)))
     refused(tmp_path / "p.ply", "point cloud", "read_points")
-    path = by_hand(tmp_path / "c.ply", {"packed_position": [0.0]}, 1)
-    refused(path, "compressed PLY")
     path = by_hand(
         tmp_path / "o.ply",
         columns_of(1, np.random.default_rng(0)),
