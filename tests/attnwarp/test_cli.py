@@ -487,7 +487,7 @@ def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, mo
     assert len(data.cameras) == 24 and len(edited) > 4
     outside, inside = [], []
     for camera, path in zip(data.cameras, data.image_paths, strict=True):
-        name = Path(camera.name).name
+        name = f"{Path(camera.name).stem}.png"
         if name in edited:
             mask = cv2.imread(str(out / "scene" / "masks" / "beach_ball" / name))[..., 0]
             # A latent is four pixels wide: its pixels go with the mask.
