@@ -309,8 +309,8 @@ def _stripes(noise: float, way: Way) -> float:
         ):
             before = np.repeat(values[..., None], 3, axis=2)
             pictures = (before, before * [0.9, 0.6, 0.8])
-            noisy = (p + noise * draw.normal(size=p.shape) for p in pictures)
-            worst = max(worst, _missed(drift(*map(to_bytes, noisy)), np.zeros(4)))
+            one, two = (to_bytes(p + noise * draw.normal(size=p.shape)) for p in pictures)
+            worst = max(worst, _missed(drift(one, two), (0.0, 0.0, 0.0, 0.0)))
     return worst
 
 
