@@ -185,7 +185,7 @@ def test_a_fold_inside_the_picture_is_refused_where_only_the_border_has_an_inver
 
 
 def first_turn(k):
-    """Where r (1 + k1 r^2 + ...), or an angle's polynomial, turns first."""
+    """First radius at which r (1 + k1 r^2 + ...), or an angle's polynomial, turns."""
     slope = [0.0] * (2 * len(k) + 1)
     slope[::2] = [(2 * i + 1) * c for i, c in enumerate((1.0, *k))]
     roots = np.roots(slope[::-1])
