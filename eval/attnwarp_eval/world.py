@@ -37,7 +37,7 @@ class World:
         content_hash: hash of the scene's file, as in a cell's spec.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.
         yaw: the same folded to [0, 180].
-        made: what a probe makes of the world for several cells, by a key of its own.
+        made: objects that a probe makes of the world for several cells, by a key of its own.
     """
 
     def __init__(self, scene: Scene, size: int) -> None:
