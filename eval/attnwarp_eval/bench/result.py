@@ -35,9 +35,10 @@ from pydantic.dataclasses import dataclass
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import read_as, without_nan
 from attnwarp_eval.document.model import Report, Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES
+from attnwarp_eval.document.numbers import FEWEST_SCENES, bracketed
 from attnwarp_eval.files import write_atomic
-from attnwarp_eval.statistics.intervals import Interval, interval, paired
+from attnwarp_eval.statistics.contrasts import paired
+from attnwarp_eval.statistics.intervals import Interval, interval
 
 PROTOCOL: Final = 3
 """Version; raised when equal pictures would get other scores."""
@@ -219,10 +220,9 @@ def bounded(value: Interval, figure: str, sign: str = "") -> str:
     """
     if math.isnan(value.mean):
         return ""
-    form = f"{sign}.{3 if figure in WARP_FIGURES else 2}f"
-    text = format(value.mean, form)
-    if value.bounded and value.scenes >= FEWEST_SCENES and figure not in SHARES:
-        text += f" [{value.low:{form}}, {value.high:{form}}]"
+    form = f"{{:{sign}.{3 if figure in WARP_FIGURES else 2}f}}".format
+    sure = value.bounded and value.scenes >= FEWEST_SCENES and figure not in SHARES
+    text = bracketed(value.mean, *((value.low, value.high) if sure else ()), form=form)
     return text + (f" ({value.undefined} undefined)" if value.undefined else "")
 
 

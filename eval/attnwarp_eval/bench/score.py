@@ -37,7 +37,7 @@ from attnwarp_eval.bench.suite import Suite, sha256, to_bytes, truth_file
 from attnwarp_eval.canonical_json import read_as, without_nan
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.cost import source_hash
-from attnwarp_eval.document.model import Grid, Picture, Report, Section, Table
+from attnwarp_eval.document.model import Grid, Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.image import edit_drift
@@ -289,16 +289,14 @@ def _grid(
     for scene in [scene for scene, name in given if name == edit][:SHOWN_SCENES]:
         sources = {"before": suite / scene / "images", "handed in": given[scene, edit]}
         for row, folder in sources.items():
-            pictures = []
+            paths = []
             for view in views:
                 file, path = folder / f"{view}.png", f"pictures/{scene}-{edit}-{row[:6]}-{view}.png"
                 if file.is_file():
                     write_atomic(out / path, file.read_bytes())
-                pictures.append(
-                    Picture(path, f"{scene}, {row}, {view}") if file.is_file() else None
-                )
-            rows.append((f"{scene}, {row}", pictures))
-    return Grid(edit, list(views), rows)
+                paths.append(path if file.is_file() else None)
+            rows.append((f"{scene}, {row}", paths))
+    return Grid.of(edit, views, rows)
 
 
 def _write(out: Path, result: Result, grids: list[Grid]) -> None:

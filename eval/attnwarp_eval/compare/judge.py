@@ -17,11 +17,11 @@ import numpy as np
 from attnwarp_eval.compare.snapshot import NOT_MEASURED, Measured, Snapshot
 from attnwarp_eval.metrics.gates import GATES, Margin, margin, same_count
 from attnwarp_eval.metrics.registry import METRICS, Metric
+from attnwarp_eval.statistics.contrasts import paired
 from attnwarp_eval.statistics.intervals import (
     ByView,
     Interval,
     benjamini_hochberg,
-    paired,
     verdict,
 )
 from attnwarp_eval.study.probe import probe as probe_of

@@ -3,8 +3,9 @@ pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 
 @dataclass
@@ -101,6 +102,26 @@ class Grid:
     caption: str
     columns: list[str]
     rows: list[tuple[str, list[Picture | None]]]
+
+    @classmethod
+    def of(
+        cls,
+        caption: str,
+        columns: Sequence[str],
+        rows: Iterable[tuple[str, Sequence[Path | str | None]]],
+    ) -> Grid:
+        """Grid of files: each row a label and a path for each column, None if missing."""
+        pictures = [
+            (
+                label,
+                [
+                    None if path is None else Picture(str(path), f"{label}, {column}")
+                    for path, column in zip(paths, columns, strict=True)
+                ],
+            )
+            for label, paths in rows
+        ]
+        return cls(caption, list(columns), pictures)
 
 
 @dataclass

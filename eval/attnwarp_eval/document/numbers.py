@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from attnwarp_eval.statistics.intervals import Interval, Ratio
 
@@ -46,10 +47,8 @@ def pooled(error: Interval, scenes: int | None = None) -> str:
         >>> pooled(interval({"bear": [0.0], "fence": [0.02]}))  # of 0 and 0.02
         '20.0 [8.63, inf]'
     """
-    text = decibels(error.mean)
-    if error.bounded:
-        text += f" [{decibels(error.high)}, {decibels(error.low)}]"
-    return text + note(error, scenes)
+    ends = (error.high, error.low) if error.bounded else ()
+    return bracketed(error.mean, *ends, form=decibels) + note(error, scenes)
 
 
 def decibels(error: float) -> str:
@@ -89,6 +88,19 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{missing}"
 
 
+def bracketed(value: float, *ends: float, form: Callable[[float], str] = number) -> str:
+    """A value with the ends of its interval, or alone without any, each written by ``form``.
+
+    Example:
+        >>> bracketed(2.0, 1.5, 2.25), bracketed(2.0)
+        ('2.00 [1.50, 2.25]', '2.00')
+        >>> bracketed(0.1, 0.05, 0.2, form="{:.0%}".format)
+        '10% [5%, 20%]'
+    """
+    between = f" [{', '.join(map(form, ends))}]" if ends else ""
+    return form(value) + between
+
+
 def ratio_text(value: Ratio) -> str:
     """A ratio of seconds with its 95 % interval, if it has one.
 
@@ -97,8 +109,7 @@ def ratio_text(value: Ratio) -> str:
         >>> [ratio_text(time_ratio([[2.0] * n], [[1.0] * n])) for n in (6, 1)]
         ['2.00 [2.00, 2.00]', '2.00']
     """
-    text = number(value.ratio)
-    return f"{text} [{number(value.low)}, {number(value.high)}]" if value.bounded else text
+    return bracketed(value.ratio, *((value.low, value.high) if value.bounded else ()))
 
 
 def note(value: Interval, scenes: int | None) -> str:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.numbers import bracketed, number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
 from attnwarp_eval.scene.scene import Scene
@@ -151,8 +151,7 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     equal, bounds = of["at_equal_error"], of["interval"]
     if equal is None:
         return [number(of["faster"]), "the plan has no noise"]
-    between = f" [{number(bounds[0])}, {number(bounds[1])}]" if bounds else ""
-    return [number(of["faster"]), number(equal) + between]
+    return [number(of["faster"]), bracketed(equal, *(bounds or ()))]
 
 
 def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -168,6 +168,38 @@ def contrast(
         interval(each),
         SignFlips(np.array(plain), ROUNDING * largest),
     )
+
+
+def paired(a: ByView, b: ByView) -> Interval:
+    """Interval of b - a over the shared views.
+
+    Student's t needs a spread, and shares often differ by exactly as much in every scene. The
+    p-value and the interval are then those of the sign test; below six scenes it has no bounds at
+    95 %.
+
+    Args:
+        a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN,
+            count as undefined.
+
+    Example:
+        >>> ours = {"bear": {"yaw010": 1.0}, "fence": {"yaw010": 2.0}}
+        >>> theirs = {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 4.0, "yaw020": 9.0}}
+        >>> value = paired(ours, theirs)
+        >>> value.mean, value.undefined
+        (1.5, 1)
+        >>> equal = paired(ours, {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 3.0}})
+        >>> equal.p, equal.bounded  # 2 / 2**2
+        (0.5, False)
+    """
+    value = contrast(a, b, "plain")
+    result, rounding = replace(value.student, undefined=value.undefined), value.flips.rounding
+    if not result.detectable <= rounding:
+        return result
+    if abs(result.mean) <= rounding:
+        return replace(result, p=1.0)  # the same values
+    sign_test = 2 * 0.5**result.scenes
+    bound = result.mean if sign_test <= 0.05 else math.nan
+    return replace(result, low=bound, high=bound, detectable=math.nan, p=sign_test)
 
 
 def _pairs(

@@ -9,7 +9,7 @@ coverage of this interval and of two bootstraps.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -113,46 +113,6 @@ def over_scenes(table: ByView) -> Interval:
 
 ROUNDING = 2e-14
 """Relative spread below which differences vary only by rounding."""
-
-
-def paired(a: ByView, b: ByView) -> Interval:
-    """Interval of b - a over the shared views.
-
-    Student's t needs a spread, and shares often differ by exactly as much in every scene. The
-    p-value and the interval are then those of the sign test; below six scenes it has no bounds at
-    95 %.
-
-    Args:
-        a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN,
-            count as undefined.
-
-    Example:
-        >>> ours = {"bear": {"yaw010": 1.0}, "fence": {"yaw010": 2.0}}
-        >>> theirs = {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 4.0, "yaw020": 9.0}}
-        >>> value = paired(ours, theirs)
-        >>> value.mean, value.undefined
-        (1.5, 1)
-        >>> equal = paired(ours, {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 3.0}})
-        >>> equal.p, equal.bounded  # 2 / 2**2
-        (0.5, False)
-    """
-    differences: dict[str, list[float]] = {}
-    largest = 0.0  # largest of the compared values
-    for scene in sorted(set(a) | set(b)):
-        left, right = a.get(scene, {}), b.get(scene, {})
-        pairs = [(left.get(v, np.nan), right.get(v, np.nan)) for v in sorted({*left, *right})]
-        differences[scene] = [after - before for before, after in pairs]
-        shared = [max(map(abs, pair)) for pair in pairs if np.isfinite(pair).all()]
-        largest = max(largest, *shared, 0.0)
-    result = interval(differences)
-    rounding = ROUNDING * largest
-    if not result.detectable <= rounding:
-        return result
-    if abs(result.mean) <= rounding:
-        return replace(result, p=1.0)  # the same values
-    sign_test = 2 * 0.5**result.scenes
-    bound = result.mean if sign_test <= 0.05 else np.nan
-    return replace(result, low=bound, high=bound, detectable=np.nan, p=sign_test)
 
 
 def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:
@@ -283,7 +243,7 @@ def verdict(
     """Verdict on a paired difference (ours - theirs): better, worse, or can't tell; never "equal".
 
     Args:
-        difference: result of :func:`paired`.
+        difference: result of :func:`~attnwarp_eval.statistics.contrasts.paired`.
         direction: which values of the metric are better.
         atol: an interval that reaches into [-atol, atol] gives "can't tell".
         adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05

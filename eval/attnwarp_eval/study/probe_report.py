@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from attnwarp_eval.document.model import Grid, Picture, Section, Table
+from attnwarp_eval.document.model import Grid, Section, Table
 from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.record import Record, View
@@ -208,16 +208,12 @@ def side_by_side(
     views = list(dict.fromkeys(view for own in rows.values() for view, _ in own))
     heads = in_degrees(views, views_of(records[shown_scene]))
 
-    def row(label: str, own: Mapping[tuple[str, str], str], shown: str) -> list[Picture | None]:
-        return [
-            Picture(own[view, shown], f"{label}, {head}") if (view, shown) in own else None
-            for view, head in zip(views, heads, strict=True)
-        ]
-
     shared = next(iter(rows.values()))
-    above = [(label, row(label, shared, shown)) for label, shown in first.items()]
-    below = [(name, row(name, own, content)) for name, own in rows.items()]
-    return Grid(caption, heads, above + below)
+    above = [
+        (label, [shared.get((view, above)) for view in views]) for label, above in first.items()
+    ]
+    below = [(name, [of.get((view, content)) for view in views]) for name, of in rows.items()]
+    return Grid.of(caption, heads, above + below)
 
 
 def scenes_side_by_side(

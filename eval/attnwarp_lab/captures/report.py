@@ -10,7 +10,7 @@ import numpy as np
 from attnwarp.editing.small import say_foreign
 from attnwarp_eval.canonical_json import write_json
 from attnwarp_eval.document import write
-from attnwarp_eval.document.model import Grid, Picture, Report, Section, Table
+from attnwarp_eval.document.model import Grid, Report, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import over_scenes
 from attnwarp_eval.study.cell import Cell
@@ -160,13 +160,13 @@ def _pictures(run: Run, records: Records) -> Section:
             if (cell.scene, cell.spec["edit"]) == (scene, title) and label not in folders:
                 folders[label] = f"{record['folder']}/renders"
                 pages.append([f"{scene} / {title}", label, f"`{record['page'] or '–'}`"])
-        rows: list[tuple[str, list[Picture | None]]] = [
-            (label, [Picture(f"{folder}/{picture_name(k)}", f"{label}, {names[k]}") for k in views])
+        rows = [
+            (label, [f"{folder}/{picture_name(k)}" for k in views])
             for label, folder in folders.items()
         ]
         if len(rows) > 1:
             heads = [Path(names[k]).stem for k in views]  # folders would run into each other
-            grids.append(Grid(f"{scene} / {title}", heads, rows))
+            grids.append(Grid.of(f"{scene} / {title}", heads, rows))
     table = Table(["edit", "variant", "page"], pages, "The splats, and all else of a variant.",
                   folded=len(edits) > 1)  # fmt: skip
     return Section("Edited scenes", ["Renders of the tuned splats."], [table], grids=grids)

@@ -8,7 +8,7 @@ from typing import Any
 
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.numbers import bracketed
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_lab.userstudy.answers import Person
 
@@ -111,5 +111,5 @@ def _text(share: Interval) -> str:
     """A share with its interval, if several people chose, and the times it was shown."""
     if not share.views:
         return "–"
-    bounds = f" [{number(share.low)}, {number(share.high)}]" if share.scenes > 1 else ""
-    return f"{number(share.mean)}{bounds} of {share.views}"
+    ends = (share.low, share.high) if share.scenes > 1 else ()
+    return f"{bracketed(share.mean, *ends)} of {share.views}"

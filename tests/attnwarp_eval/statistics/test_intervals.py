@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from attnwarp_eval.statistics.contrasts import paired
 from attnwarp_eval.statistics.intervals import (
     benjamini_hochberg,
     common,
     front,
     interval,
-    paired,
     time_ratio,
     verdict,
 )

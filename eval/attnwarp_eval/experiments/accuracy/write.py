@@ -109,7 +109,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
     from scipy import stats
 
     from attnwarp_eval.document.model import Section, Table
-    from attnwarp_eval.document.numbers import number, ratio_text
+    from attnwarp_eval.document.numbers import bracketed, number, ratio_text
 
     sections = []
     for question, title in TITLES.items():
@@ -126,11 +126,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
             rows = []
             for k, c in enumerate(panel.contestants):
                 value, low, high = c.error
-                error = (
-                    number(value)
-                    if low == high
-                    else f"{number(value)} [{number(low)}, {number(high)}]"
-                )
+                error = bracketed(value, *((low, high) if low < high else ()))
                 if question == "pictures":
                     half = 100 * c.more["bias_error"] * stats.t.ppf(0.975, len(c.seconds) - 1)
                     more = [
@@ -146,7 +142,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                     error = f"{value:.1e}"
                 else:
                     more = [f"{100 * c.more[key]:.1f} %" for key in ("wrong", "unanswered")]
-                    error = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+                    error = bracketed(*(100 * x for x in c.error), form="{:.1f}".format) + " %"
                 times = [
                     number(1000 * float(np.median(c.seconds))),
                     "1" if k == 0 else ratio_text(panel.ratio(k)),

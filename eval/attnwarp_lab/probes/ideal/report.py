@@ -8,7 +8,8 @@ from typing import ClassVar
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import spread
-from attnwarp_eval.statistics.intervals import interval, over_scenes, paired
+from attnwarp_eval.statistics.contrasts import paired
+from attnwarp_eval.statistics.intervals import interval, over_scenes
 from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section

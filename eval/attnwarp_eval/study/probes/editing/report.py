@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import median
 from typing import Any, ClassVar
 
-from attnwarp_eval.document.model import Grid, Picture, Section, Table
+from attnwarp_eval.document.model import Grid, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import over_scenes
 from attnwarp_eval.study.probe_report import (
@@ -18,7 +18,7 @@ from attnwarp_eval.study.probe_report import (
     views_of,
 )
 from attnwarp_eval.study.probes.editing.result import EditResult
-from attnwarp_eval.study.record import PictureFile, Record
+from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.encoders import encoders_named
 from attnwarp_eval.study.shared.method_run import is_alone
@@ -232,30 +232,25 @@ def side_by_side(results: Results, probe: str) -> Section | None:
 def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
     """Pictures of one edit, by method and view."""
     files = {
-        name: {(p.content, p.view.rpartition("/")[2]): p for p in record.pictures}
+        name: {(p.content, p.view.rpartition("/")[2]): p.path for p in record.pictures}
         for name, record in methods.items()
     }
     views = list(dict.fromkeys(view for own in files.values() for _, view in own))
     heads = [SOURCE, *in_degrees(views, views_of(methods.values()))]
 
-    def row(
-        label: str, own: Mapping[tuple[str, str], PictureFile], shown: str, source: str = ""
-    ) -> tuple[str, list[Picture | None]]:
-        first = next((p for (content, _), p in own.items() if content == source), None)
-        pictures = [first, *(own.get((shown, view)) for view in views)]
-        return label, [
-            None if picture is None else Picture(picture.path, f"{label}, {head}")
-            for picture, head in zip(pictures, heads, strict=True)
-        ]
+    def row(label: str, name: str, content: str, source: str = "") -> tuple[str, list[str | None]]:
+        of = files[name]
+        first = next((path for (content, _), path in of.items() if content == source), None)
+        return label, [first, *(of.get((content, view)) for view in views)]
 
-    rows = [row("before", next(iter(files.values())), "before")]
+    rows = [row("before", next(iter(files)), "before")]
     truths: dict[tuple[str, ...], list[str]] = {}
-    for name, own in files.items():
-        undone = "" if methods[name].comparable else f" {UNDONE}"
-        rows.append(row(name + undone, own, "edited", "source-edit"))
-        if truth := tuple(p.sha256 for (content, _), p in own.items() if content == "truth"):
+    for name, record in methods.items():
+        undone = "" if record.comparable else f" {UNDONE}"
+        rows.append(row(name + undone, name, "edited", "source-edit"))
+        if truth := tuple(p.sha256 for p in record.pictures if p.content == "truth"):
             truths.setdefault(truth, []).append(name)
     for names in truths.values():
         label = "truth" if len(truths) == 1 else f"truth: {', '.join(names)}"
-        rows.append(row(label, files[names[0]], "truth"))
-    return Grid(caption, heads, rows)
+        rows.append(row(label, names[0], "truth"))
+    return Grid.of(caption, heads, rows)
