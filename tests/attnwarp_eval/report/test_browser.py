@@ -95,8 +95,23 @@ def crowded(tmp_path_factory):
         with charts.drawing(path) as (axes,):
             charts.cost_front(axes, intervals, x="milliseconds", y="error", title="Front")
         section.figures.append(Picture(path.name, "Front"))
-    write_files(Report("Crowded", [], [section]), folder, "report")
+    # More titles than one line of 1400 px holds.
+    titled = [Section(f"In detail: where the labels of parts arrive, {k}") for k in range(9)]
+    write_files(Report("Crowded", [], [section, *titled]), folder, "report")
     return folder / "report.html"
+
+
+def test_the_bar_of_a_wide_page_shows_every_section(crowded):
+    async def person():
+        async with browser.opened(crowded.as_uri(), (1400, 900)) as tab:
+            await tab.until("document.readyState == 'complete'")
+            ends = (
+                "[...document.querySelectorAll('nav a')].map(a => a.getBoundingClientRect().right)"
+            )
+            return await tab.run(ends)
+
+    ends = asyncio.run(person())
+    assert len(ends) == 10 and max(ends) <= 1400
 
 
 @pytest.mark.parametrize("width", WIDTHS)
