@@ -129,7 +129,7 @@ def test_no_feature_comes_from_what_the_sources_mask_ignores(scene, editor):
 
     def warp(*masks):
         work = work_of(model, Views(views, images, masks), editor, settings)
-        return Geometry(work, settings, None).warp(0, 1, model)
+        return Geometry(work, settings.warp, None).warp(0, 1, model)
 
     whole, part = warp(), warp(left, None, None)
     read = whole.correspondence.xy[..., 0]
