@@ -67,7 +67,7 @@ def read_as(kind: type[T], path: Path, remedy: str) -> T:
     Args:
         kind: class of the content.
         path: path of the file.
-        remedy: what to do about a bad file, in words.
+        remedy: advice on a bad file, in words.
 
     Raises:
         InputError: the file is missing, no JSON, or an entry is missing, unknown or wrong.

@@ -1,4 +1,4 @@
-"""What ``make count`` counts."""
+"""Lines that ``make count`` counts."""
 
 from __future__ import annotations
 

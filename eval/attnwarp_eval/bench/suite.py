@@ -66,9 +66,9 @@ class Edit:
 
     Attributes:
         name: its name.
-        instruction: what to do, in words.
-        source: what the scene shows before.
-        target: what it shows after.
+        instruction: the change, in words.
+        source: the scene before, in words.
+        target: the scene after, in words.
         answers: number of right answers.
     """
 
@@ -152,7 +152,7 @@ class Suite:
 
 @dataclass(frozen=True, config=STRICT)
 class _Listing:
-    """What a finished scene was asked to be, and SHA-256 of its files by path."""
+    """Settings of a finished scene, and SHA-256 of its files by path."""
 
     asked: dict[str, int]
     files: dict[str, str]
