@@ -17,9 +17,9 @@ from attnwarp_eval.scene.meshes.polygons import triangulate
 from attnwarp_eval.scene.meshes.surface import Surface
 from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 
-READER_PROTOCOL = 3
-"""Version; raised when the same file would give other triangles or colours; part of the hash of
-scenes with mesh files."""
+READER_PROTOCOL = 2
+"""Version; raised when the same file would give another surface or other colours; part of the hash
+of every scene's content."""
 
 # No .gltf: it keeps its vertices in another file, which a hash of the .gltf would miss.
 READERS = {".ply": read_ply, ".glb": read_glb}
