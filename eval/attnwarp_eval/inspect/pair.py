@@ -486,6 +486,8 @@ class Pair:
         parts["source, warped"] = self._warped(next(iter(parts.values())), layer)
         title = "mask" if self.truth is None else "mask against truth"
         parts[title] = self.colors("mask", layer)
+        if isinstance(self.edit, RunEdit):
+            parts |= self.edit.details(self.target)
         return parts
 
     def _warped(self, source: Image, layer: Size | None) -> Image:
