@@ -113,7 +113,13 @@ def ratio_text(value: Ratio) -> str:
 
 
 def note(value: Interval, scenes: int | None) -> str:
-    """Note, in brackets, on values missing from a mean."""
+    """Note, in brackets, on values missing from a mean.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> note(interval({"bear": [1.0], "fence": [2.0]}), scenes=3)
+        ' (2 of 3 scenes)'
+    """
     notes = [f"{value.undefined} undefined"] if value.undefined else []
     if scenes is not None and value.scenes < scenes:
         notes.append(f"{value.scenes} of {scenes} scenes")

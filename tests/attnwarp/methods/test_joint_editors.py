@@ -72,7 +72,9 @@ def test_the_sources_edit_is_a_second_reference_plain_or_warped(scene):
 def test_a_killed_edit_goes_on_to_the_same_bytes(scene, tmp_path):
     changes = {"reference": "warped", "iterations": 2}
     edited(scene, "klein", tmp_path / "whole", **changes)
-    assert json.loads((tmp_path / "whole" / "result.json").read_text())["advice"] is None
+    # Two steps of Adam are as small as its learning rates.
+    advice = json.loads((tmp_path / "whole" / "result.json").read_text())["advice"]
+    assert advice.startswith("the splats hardly took the edit: try more --iterations")
     for moment in (3, 9):  # in the source's edit, and after it
         folder = tmp_path / str(moment)
         with pytest.MonkeyPatch.context() as patch:
