@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
+from attnwarp.command.edit import marked, view_of
+from attnwarp.command.marks import Marks
 from attnwarp.fit import load_views
 from attnwarp.io import read_dataset, read_ply
-from attnwarp.methods.command import marked, view_of
-from attnwarp.methods.marks import Marks
-from attnwarp.methods.scene import images_of
 from attnwarp.reporting import SILENT
 
 HERE = Path(__file__).parent
@@ -46,10 +46,11 @@ def overlaps(name: str, about: dict, captures: Path, fits: Path) -> dict:
         Image.fromarray(mask).save(HERE / f"{name}-{view}.png", bits=1, optimize=True)
     dataset = read_dataset(captures / name)
     views, splats = load_views(dataset, max_size=SIDE), read_ply(fits / name / "splats.ply")
-    images, result = images_of(views), {}
+    result = {}
     for source, at in about["clicks"].items():
         index, marks = view_of(dataset, source), Marks(at=tuple(at))
-        lifted = marked(marks, "", dataset, views, images, index, Path(), "cpu", SILENT)(splats)
+        with tempfile.TemporaryDirectory() as out:  # of the marked picture
+            lifted = marked(marks, "", dataset, views, index, Path(out), "cpu", SILENT)(splats)
         found = {view: lifted[view_of(dataset, view)] > 0.5 for view in masks}
         result[source] = {
             view: round(float((found[view] & mask).sum() / (found[view] | mask).sum()), 3)
