@@ -140,10 +140,10 @@ def test_the_table_of_the_docs_is_true(tmp_path, monkeypatch, row):
 
 @pytest.mark.parametrize("program", dict.fromkeys(program for program, _, _ in CHECKS))
 def test_the_versions_in_the_docs_are_no_newer_than_what_was_tried(program):
-    try:
-        version = importlib.metadata.version(program.lower())
-    except importlib.metadata.PackageNotFoundError:
+    packages = importlib.metadata.packages_distributions().get(program.lower(), ())
+    if not packages:
         skip_without(program)
+    version = importlib.metadata.version(packages[0])  # Open3D comes as open3d-cpu, too
     stated = {v for name, v, _, _ in table() if name == program}
     assert len(stated) == 1
     number = lambda text: [int(part) for part in text.split(".")[:3]]  # noqa: E731
