@@ -180,6 +180,14 @@ class Program(TyperGroup):
                 raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
         return super().resolve_command(ctx, args)
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the named command; a refused choice is told without pydantic's first words."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
+
 
 def use_threads(threads: int | None) -> None:
     """Set the threads of the renderer and of torch. Splats fitted without an exposure have the same

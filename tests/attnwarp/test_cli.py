@@ -113,6 +113,12 @@ def test_help_of_80_columns_cuts_no_name_and_no_word(name):
     assert len(text.splitlines()) < 180
 
 
+def test_a_choice_that_is_none_is_told_in_the_words_of_the_command_line(tmp_path):
+    done = CliRunner().invoke(app, ["fit", str(tmp_path), "--kind", "foo"], env={"COLUMNS": "120"})
+    assert done.exit_code == 2
+    assert "Invalid value for '--kind': 'foo' is not one of '2dgs', '3dgs'." in done.stderr
+
+
 def test_the_help_of_each_option_is_a_sentence_and_that_of_edit_begins_with_what_most_set():
     for name, command in get_command(app).commands.items():
         for option in command.params:
