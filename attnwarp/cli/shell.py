@@ -170,6 +170,14 @@ COMMANDS = {
 """Commands available in only one of the two programs."""
 
 
+def _show_no_type_of_flags(params: list[Any]) -> list[Any]:
+    """Help of a flag would show the type <bool>, though it takes no value."""
+    for param in params:
+        if getattr(param, "is_flag", False):
+            param.metavar = ""
+    return params
+
+
 class Program(TyperGroup):
     """Commands of a program; a command of the other program gets a hint."""
 
@@ -178,7 +186,14 @@ class Program(TyperGroup):
         for name, commands in COMMANDS.items():
             if args[0] in commands and args[0] not in self.commands:
                 raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
-        return super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
+        if command:
+            _show_no_type_of_flags(command.get_params(ctx))
+        return name, command, rest
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options of the program itself."""
+        return _show_no_type_of_flags(super().get_params(ctx))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the named command; a refused choice is told without pydantic's first words."""

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import typer
 
+from attnwarp.cli.shell import Program
 from attnwarp_eval.cli.shell import clear_errors
 
 app = typer.Typer(
-    help="Derived files (meshes, true pictures, splats), kept to save time.", no_args_is_help=True
+    cls=Program,
+    help="Derived files (meshes, true pictures, splats), kept to save time.",
+    no_args_is_help=True,
 )
 
 

@@ -11,7 +11,9 @@ import pytest
 import typer
 from further import further
 from typer.core import TyperOption
+from typer.testing import CliRunner
 
+import attnwarp.cli.main
 from attnwarp.cli.shell import file_error
 from attnwarp_eval.cli import main
 
@@ -85,6 +87,18 @@ def test_each_options_help_is_a_sentence(name):
     texts = {p.name: p.help for p in command.params if isinstance(p, TyperOption)}
     for option, text in texts.items():
         assert text[0].isupper() and text.endswith(".") and len(text.split()) > 3, option
+
+
+@pytest.mark.parametrize("app", [main.app, attnwarp.cli.main.app])
+def test_no_flag_seems_to_take_a_value(app):
+    def commands(group, words):
+        yield words
+        for name, command in getattr(group, "commands", {}).items():
+            yield from commands(command, [*words, name])
+
+    for words in commands(typer.main.get_command(app), []):
+        help_of = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "120"})
+        assert "--help" in help_of.stdout and "<bool>" not in help_of.stdout, words
 
 
 def test_output_to_a_full_disk_is_one_line_and_exit_code_2():
