@@ -55,7 +55,9 @@ def convert(
         ),
     ] = "auto",
 ) -> None:
-    """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin."""
+    """Convert splats for other programs: 2DGS as thin 3DGS, as .splat, with fewer
+    harmonics or in world coordinates.
+    """
     with clear_errors():
         suffix = out.suffix.lower()
         if suffix not in FORMATS:
@@ -101,7 +103,7 @@ def undistort(
     *,
     reading: Reading,
 ) -> None:
-    """Resample pictures to pinhole cameras, for lens models that OpenCV has."""
+    """Resample pictures of distorted cameras as pinhole cameras would see them."""
     with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
         check_out(out)
         import attnwarp.io

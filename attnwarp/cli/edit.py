@@ -160,7 +160,6 @@ def edit(
         Kind | None,
         of_splats(
             "Fit 2dgs (default) or 3dgs; with --ply, read it as this kind, whatever it says.",
-            "KIND",
         ),
     ] = None,
     antialiased: AntialiasedOption = None,
@@ -170,7 +169,6 @@ def edit(
         of_machine(
             "Keep recorded features in main memory (cpu, the default), with the editor (device) or"
             " on disk.",
-            "WHERE",
         ),
     ] = None,
     anyway: AnywayOption = False,

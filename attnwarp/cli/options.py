@@ -73,9 +73,7 @@ EditorOption = Annotated[
 
 WhereOption = Annotated[
     str | None,
-    option(
-        'Edit only what these words name in the source view, such as "bear".', "WORDS", "--where"
-    ),
+    option('Edit only what these words name in the picture, such as "bear".', "WORDS", "--where"),
 ]
 
 BoxOption = Annotated[
@@ -133,7 +131,9 @@ LowMemoryOption = Annotated[
 
 DataArgument = Annotated[
     Path,
-    typer.Argument(help="Posed pictures: a transforms.json, its folder, or a COLMAP folder."),
+    typer.Argument(
+        help="Posed pictures: a transforms.json, its folder, or a folder of COLMAP or BlendedMVS."
+    ),
 ]
 
 
@@ -175,7 +175,7 @@ class Reading:
 
     format: Annotated[
         Literal["transforms", "colmap"] | None,
-        of_reading("Read this format, transforms or colmap, if DATA holds both.", "NAME"),
+        of_reading("Read this format if DATA holds both."),
     ] = None
     images: Annotated[
         Path | None, of_reading("Read the pictures of a COLMAP model from this folder.", "FOLDER")
@@ -189,9 +189,7 @@ class Reading:
     ] = 1
     missing_images: Annotated[
         Literal["error", "none"],
-        of_reading(
-            "Stop at a camera whose picture is missing (error), or leave it out (none).", "WHAT"
-        ),
+        of_reading("Stop at a camera whose picture is missing (error), or leave it out (none)."),
     ] = "error"
     resize_cameras: Annotated[
         bool,
@@ -222,7 +220,9 @@ class Marking:
     source: Annotated[
         str | None,
         option(
-            "Mark and edit this view first, by its name or number (default: the first).", "VIEW"
+            "Mark and edit this view first, by its name or number (default: the first that is not"
+            " held out).",
+            "VIEW",
         ),
     ] = None
     at: AtOption = None

@@ -26,9 +26,12 @@ from attnwarp.reporting import reporter
 
 @options_of(Reading, without="missing_images")
 def render(
-    model: Annotated[Path, typer.Argument(help="Splats to render: a .ply or .splat file.")],
+    model: Annotated[
+        Path, typer.Argument(help="Splats to render: .ply, .splat, .spz, .sog or .ksplat.")
+    ],
     cameras: Annotated[
-        Path, typer.Argument(help="Cameras: a transforms.json, its folder, or a COLMAP folder.")
+        Path,
+        typer.Argument(help="Cameras: transforms.json or its folder, COLMAP, BlendedMVS."),
     ],
     out: Annotated[Path, option("Write the pictures to this folder.", "FOLDER")],
     background: Annotated[
