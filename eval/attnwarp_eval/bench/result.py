@@ -221,7 +221,7 @@ def bounded(value: Interval, figure: str, sign: str = "") -> str:
     if math.isnan(value.mean):
         return ""
     form = f"{{:{sign}.{3 if figure in WARP_FIGURES else 2}f}}".format
-    sure = value.bounded and value.scenes >= FEWEST_SCENES and figure not in SHARES
+    sure = value.scenes >= FEWEST_SCENES and figure not in SHARES
     text = bracketed(value.mean, *((value.low, value.high) if sure else ()), form=form)
     return text + (f" ({value.undefined} undefined)" if value.undefined else "")
 

@@ -47,8 +47,7 @@ def pooled(error: Interval, scenes: int | None = None) -> str:
         >>> pooled(interval({"bear": [0.0], "fence": [0.02]}))  # of 0 and 0.02
         '20.0 [8.63, inf]'
     """
-    ends = (error.high, error.low) if error.bounded else ()
-    return bracketed(error.mean, *ends, form=decibels) + note(error, scenes)
+    return bracketed(error.mean, error.high, error.low, form=decibels) + note(error, scenes)
 
 
 def decibels(error: float) -> str:
@@ -89,16 +88,18 @@ def spread(value: Interval, scenes: int | None = None) -> str:
 
 
 def bracketed(value: float, *ends: float, form: Callable[[float], str] = number) -> str:
-    """A value with the ends of its interval, or alone without any, each written by ``form``.
+    """A value with the ends of its interval, each written by ``form``; alone where an end is
+    undefined, or without any.
 
     Example:
-        >>> bracketed(2.0, 1.5, 2.25), bracketed(2.0)
-        ('2.00 [1.50, 2.25]', '2.00')
+        >>> bracketed(2.0, 1.5, 2.25), bracketed(2.0), bracketed(2.0, math.nan, math.nan)
+        ('2.00 [1.50, 2.25]', '2.00', '2.00')
         >>> bracketed(0.1, 0.05, 0.2, form="{:.0%}".format)
         '10% [5%, 20%]'
     """
-    between = f" [{', '.join(map(form, ends))}]" if ends else ""
-    return form(value) + between
+    if not ends or not all(map(math.isfinite, ends)):
+        return form(value)
+    return f"{form(value)} [{', '.join(map(form, ends))}]"
 
 
 def ratio_text(value: Ratio) -> str:
@@ -109,7 +110,7 @@ def ratio_text(value: Ratio) -> str:
         >>> [ratio_text(time_ratio([[2.0] * n], [[1.0] * n])) for n in (6, 1)]
         ['2.00 [2.00, 2.00]', '2.00']
     """
-    return bracketed(value.ratio, *((value.low, value.high) if value.bounded else ()))
+    return bracketed(value.ratio, value.low, value.high)
 
 
 def note(value: Interval, scenes: int | None) -> str:

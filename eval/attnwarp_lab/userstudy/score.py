@@ -111,5 +111,4 @@ def _text(share: Interval) -> str:
     """A share with its interval, if several people chose, and the times it was shown."""
     if not share.views:
         return "–"
-    ends = (share.low, share.high) if share.scenes > 1 else ()
-    return f"{bracketed(share.mean, *ends)} of {share.views}"
+    return f"{bracketed(share.mean, share.low, share.high)} of {share.views}"
