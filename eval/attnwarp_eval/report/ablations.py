@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, note, number, pooled, spread
-from attnwarp_eval.report.compared import between, detectable_text
-from attnwarp_eval.report.controls import UNCONTROLLED, outcome_of
+from attnwarp_eval.report.compared import detectable_text, differences_of
+from attnwarp_eval.report.controls import UNCONTROLLED, outcomes_of
 from attnwarp_eval.report.judging import Comparison, judged
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import ProbeReport, mean_values, report_of
@@ -89,8 +89,8 @@ def main_columns(own: ProbeReport, results: Results) -> dict[str, str]:
     """Columns of a short table, title -> metric: those in which variants are compared."""
     columns = own.columns_at(results.layer)
     titles = {metric: title for title, metric in columns.items()}
-    metrics = [metric.format(layer=results.layer) for metric in own.contrasts]
-    return {titles.get(metric, metric): metric for metric in metrics or columns.values()}
+    metrics = own.contrasts_at(results.layer) or columns.values()
+    return {titles.get(metric, metric): metric for metric in metrics}
 
 
 def _main(results: Results, ablation: Ablation, compared: Sequence[Comparison]) -> Table:
@@ -193,22 +193,19 @@ def _comparisons(
 ) -> Iterator[Comparison]:
     """Each variant against the baseline, in each metric that the probe tests."""
     name, baseline = ablation.probe, ablation.baseline
-    metrics = [metric.format(layer=results.layer) for metric in report_of(name).contrasts]
-    edits, control = probe(name).edits, UNCONTROLLED
-    outcomes = {m: outcome_of(results, name, m, baseline) if edits else control for m in metrics}
-    for variant in ablation.variants:
-        for metric in metrics if variant != baseline else ():
-            value = between(results, name, baseline, variant, metric)
-            better = probe(name).metric(metric).direction
-            direction = better if better in ("higher", "lower") else None
-            one = Comparison(name, metric, baseline, variant, value, direction, outcomes[metric])
-            claim = claimed.get((name, metric, frozenset((baseline, variant))))
-            if claim is not None and direction is not None:
-                word = claim.word
-                if word in ("better", "worse"):  # of what the claim expects
-                    word = value.verdict(direction, adjusted_p=claim.p)
-                one = replace(one, claim=claim.claim, p=claim.p, word=word)
-            yield one
+    outcomes = outcomes_of(results, name, baseline)
+    for variant, metric, value in differences_of(results, ablation):
+        better = probe(name).metric(metric).direction
+        direction = better if better in ("higher", "lower") else None
+        outcome = outcomes.get(metric, UNCONTROLLED)
+        one = Comparison(name, metric, baseline, variant, value, direction, outcome)
+        claim = claimed.get((name, metric, frozenset((baseline, variant))))
+        if claim is not None and direction is not None:
+            word = claim.word
+            if word in ("better", "worse"):  # of what the claim expects
+                word = value.verdict(direction, adjusted_p=claim.p)
+            one = replace(one, claim=claim.claim, p=claim.p, word=word)
+        yield one
 
 
 def _table(compared: Sequence[Comparison], baseline: str) -> Table:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView
 from attnwarp_eval.study.probe import probe, probes
+from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Ablation
 
 Yaw = tuple[float, float]
 
@@ -31,6 +34,14 @@ def between(
     a, b = (results.views(name, who, metric, yaw) for who in (first, second))
     sides = [_counts(results, name, who, metric, yaw) for who in (first, second)]
     return on_scale(results, name, metric, a, b, sides)
+
+
+def differences_of(results: Results, table: Ablation) -> Iterator[tuple[str, str, Contrast]]:
+    """Variant, metric and contrast with the baseline of a table, in all metrics that it tests."""
+    name, baseline = table.probe, table.baseline
+    for variant in table.variants:
+        for metric in report_of(name).contrasts_at(results.layer) if variant != baseline else ():
+            yield variant, metric, between(results, name, baseline, variant, metric)
 
 
 def on_scale(

@@ -11,7 +11,7 @@ import numpy as np
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
-from attnwarp_eval.report.compared import between
+from attnwarp_eval.report.compared import Yaw, between
 from attnwarp_eval.statistics.contrasts import Verdict
 from attnwarp_eval.statistics.intervals import ByView, common
 from attnwarp_eval.study.probe import probe
@@ -140,24 +140,40 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
     }
 
 
-def seen(results: Results, name: str, metric: str, baseline: str, label: str) -> bool:
-    """Return True if a figure tells a control from its variant, as worse."""
+def seen(
+    results: Results,
+    name: str,
+    metric: str,
+    variant: str,
+    control: str,
+    *,
+    expected: Literal["worse", "better"] = "worse",
+    yaw: Yaw | None = None,
+) -> bool:
+    """Return True if a figure tells a control from its variant, as ``expected``; False for a
+    figure without a better direction.
+    """
     direction = probe(name).metric(metric).direction
-    judged = between(results, name, baseline, label, metric).verdict(direction)  # type: ignore[arg-type]
-    return judged == "worse"
+    if direction not in ("higher", "lower"):
+        return False
+    return between(results, name, variant, control, metric, yaw).verdict(direction) == expected
 
 
-def outcome_of(results: Results, name: str, metric: str, baseline: str) -> Outcome:
-    """Outcome of a variant's controls in a figure: seen if it separates any of them from it.
+def seen_by(results: Results, name: str, baseline: str) -> dict[str, dict[str, bool]]:
+    """Metric -> control of a variant -> whether the metric sees it; empty without controls."""
+    labels = controls_of(results, name, baseline) if probe(name).edits else {}
+    metrics = report_of(name).contrasts_at(results.layer) if labels else []
+    return {m: {one: seen(results, name, m, baseline, one) for one in labels} for m in metrics}
+
+
+def outcomes_of(results: Results, name: str, baseline: str) -> dict[str, Outcome]:
+    """Metric -> outcome of a variant's controls: seen if it separates any of them from it.
 
     Features from the wrong place must do worse. Otherwise the figure does not depend on the
     source of features, so "can't tell" about two warps says nothing.
     """
-    of = controls_of(results, name, baseline)
-    if not of:
-        return UNCONTROLLED
-    any_seen = any(seen(results, name, metric, baseline, label) for label in of)
-    return Outcome("seen" if any_seen else "not seen")
+    told = seen_by(results, name, baseline)
+    return {m: Outcome("seen" if any(of.values()) else "not seen") for m, of in told.items()}
 
 
 def controls(results: Results) -> list[Section]:
@@ -167,12 +183,7 @@ def controls(results: Results) -> list[Section]:
     if len(results.study.scenes) < FEWEST_SCENES:
         return []
     pairs = {(one.probe, one.baseline): None for one in results.study.ablations}
-    tables = [
-        table
-        for name, baseline in pairs
-        if probe(name).edits
-        for table in _tables(results, name, baseline)
-    ]
+    tables = [table for pair in pairs for table in _tables(results, *pair)]
     if not tables:
         return []
     text = (
@@ -183,25 +194,17 @@ def controls(results: Results) -> list[Section]:
 
 
 def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:
-    controls = controls_of(results, name, baseline)
-    if not controls:
+    told = {
+        metric: of
+        for metric, of in seen_by(results, name, baseline).items()
+        if probe(name).metric(metric).direction in ("higher", "lower")
+    }
+    if not told:
         return
-    metrics = [metric.format(layer=results.layer) for metric in report_of(name).contrasts]
-    metrics = [m for m in metrics if probe(name).metric(m).direction in ("higher", "lower")]
     rows = [
-        [
-            label,
-            "seen",
-            *(
-                "seen" if seen(results, name, metric, baseline, label) else "not seen"
-                for metric in metrics
-            ),
-        ]
-        for label in controls
+        [label, "seen", *("seen" if of[label] else "not seen" for of in told.values())]
+        for label in next(iter(told.values()))
     ]
-    answers = [
-        "sees" if outcome_of(results, name, m, baseline).seen == "seen" else "blind"
-        for m in metrics
-    ]
+    answers = ["sees" if any(of.values()) else "blind" for of in told.values()]
     rows.append(["this figure is", "", *answers])
-    yield Table(["control", "expected", *metrics], rows, f"Controls of {baseline!r}")
+    yield Table(["control", "expected", *told], rows, f"Controls of {baseline!r}")

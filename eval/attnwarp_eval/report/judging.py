@@ -13,7 +13,14 @@ from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.claims import Claim
 from attnwarp_eval.report.compared import between, difference_text, in_words, no_verdict
-from attnwarp_eval.report.controls import UNCONTROLLED, Outcome, control_share, share_text, word_of
+from attnwarp_eval.report.controls import (
+    UNCONTROLLED,
+    Outcome,
+    control_share,
+    seen,
+    share_text,
+    word_of,
+)
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast, Verdict
 from attnwarp_eval.statistics.intervals import benjamini_hochberg, common, over_scenes
 from attnwarp_eval.statistics.planning import MOST_SCENES
@@ -159,13 +166,13 @@ def _measured(results: Results, claim: Claim) -> Comparison | None:
         control = Outcome("not measured", expected)
         if label is not None and direction in ("higher", "lower"):
             names.add(label)
-            seen = between(results, name, b, label, key, claim.yaw).verdict(direction) == expected
             share = None
             if expected == "worse" and "metric" not in claim.control:
                 table = results.views(name, label, key, claim.yaw)
                 sign = 1 if direction == "higher" else -1
                 share = control_share(tables[1], table, tables[0], sign=sign)
-            control = Outcome("seen" if seen else "not seen", expected, share)
+            told = seen(results, name, key, b, label, expected=expected, yaw=claim.yaw)
+            control = Outcome("seen" if told else "not seen", expected, share)
     finished = claim.planned(results.study) and all(
         cell.record is not None
         for cell in results.cells

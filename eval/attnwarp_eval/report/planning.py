@@ -13,13 +13,13 @@ from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.claims import load_claims
-from attnwarp_eval.report.compared import between
+from attnwarp_eval.report.compared import differences_of
 from attnwarp_eval.report.judging import count_of, measured
 from attnwarp_eval.statistics.contrasts import Contrast
 from attnwarp_eval.statistics.planning import scenes_needed
 from attnwarp_eval.statistics.scales import Scale
 from attnwarp_eval.statistics.signflips import FEWEST
-from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 
@@ -67,13 +67,10 @@ def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
         assert one.claim is not None
         yield one.claim.text, one.metric, one.specification, one.contrast
     for table in results.study.ablations:
-        own = report_of(table.probe)
-        for name in table.variants:
-            for key in (one.format(layer=results.layer) for one in own.contrasts):
-                metric = own.probe.metric(key)
-                if name != table.baseline and metric.direction in ("higher", "lower"):
-                    value = between(results, own.name, table.baseline, name, key)
-                    yield f"{name} against {table.baseline}", key, metric, value
+        for variant, key, value in differences_of(results, table):
+            metric = probe(table.probe).metric(key)
+            if metric.direction in ("higher", "lower"):
+                yield f"{variant} against {table.baseline}", key, metric, value
 
 
 def _difference(value: float, scale: Scale) -> str:

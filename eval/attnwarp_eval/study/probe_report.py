@@ -90,6 +90,10 @@ class ProbeReport:
             for title, metric in {**columns, **own}.items()
         }
 
+    def contrasts_at(self, layer: int) -> list[str]:
+        """Metrics in which variants are tested; a grid has ``layer`` cells a side."""
+        return [metric.format(layer=layer) for metric in self.contrasts]
+
     def problems(self, results: Results) -> list[str]:
         """Faults of the instrument found in this probe's records, one line each."""
         return []
