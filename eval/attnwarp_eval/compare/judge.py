@@ -162,7 +162,7 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     faults, added = _missing_cells(left, right, run, exact)
     for key in sorted(left.keys() & right.keys()):
         first, second = left[key], right[key]
-        name = " / ".join(key)
+        name = _name(key)
         if {c.definition for c in first} != {c.definition for c in second}:
             detail = "another scene, setting, encoder or protocol than the baseline's"
             if common:
@@ -239,7 +239,11 @@ def _without_psnr(
 
 
 def _key(scene: str, probe: str, variant: str, seed: int, exact: bool) -> Key:
-    return (scene, probe, variant, f"seed {seed}") if exact else (scene, probe, variant)
+    return (scene, probe, variant, str(seed)) if exact else (scene, probe, variant)
+
+
+def _name(key: Key) -> str:
+    return " / ".join((*key[:3], *(f"seed {seed}" for seed in key[3:])))
 
 
 def _missing_cells(
@@ -272,14 +276,14 @@ def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fa
                 for key, why in rest.items()
                 if place < len(key) and key[place] not in has and why == reason
             ]
-            names = sorted({key[place].removeprefix("seed ") for key in keys})
+            names = sorted({key[place] for key in keys})
             if keys:
                 cells = f"{len(keys)} {_plural('cell', keys)}"
                 detail = f"{cells} {reason}" if reason else cells
                 name = f"{_plural(what, names)} {', '.join(names)}"
                 faults.append(Fault("unmeasured", name, detail))
                 rest = {key: why for key, why in rest.items() if key not in keys}
-    return faults + [Fault("missing", " / ".join(key), why) for key, why in sorted(rest.items())]
+    return faults + [Fault("missing", _name(key), why) for key, why in sorted(rest.items())]
 
 
 def _plural(word: str, counted: Collection[object]) -> str:

@@ -8,9 +8,28 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 
+class Marked(str):
+    """Cell of a table in the colour of its verdict, a class of the page's style.
+
+    Example:
+        >>> cell = Marked("1.25 ± 0.20 worse", "worse")
+        >>> cell.verdict, cell.startswith("1.25")
+        ('worse', True)
+    """
+
+    verdict: str
+
+    def __new__(cls, text: str, verdict: str) -> Marked:
+        """Mark a text."""
+        cell = super().__new__(cls, text)
+        cell.verdict = verdict
+        return cell
+
+
 @dataclass
 class Table:
-    """A table of ready-made text cells.
+    """A table of ready-made text cells; those that hold more than a verdict's word, and have its
+    colour, are :class:`Marked`.
 
     Columns named in ``timed`` hold seconds or memory. A ``folded`` table is collapsed on a page
     until a reader opens it, and is left out of short Markdown. In a ``glossary`` the first column

@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from attnwarp.io.picture import encode_picture
-from attnwarp_eval.document.model import Gallery, Picture, Report, Slider, Table
+from attnwarp_eval.document.model import Gallery, Marked, Picture, Report, Slider, Table
 from attnwarp_eval.files import write_atomic
 
 if TYPE_CHECKING:
@@ -64,12 +64,9 @@ def _block(text: str) -> Markup:
 
 
 def _css(cell: str) -> Markup:
-    if cell in _CLASSES:
-        return Markup(f' class="{_CLASSES[cell]}"')
-    if cell.endswith("no verdict"):
-        return Markup(' class="untold"')
-    if cell.rpartition(" ")[2] in ("better", "worse"):
-        return Markup(f' class="{cell.rpartition(" ")[2]}"')
+    marked = cell.verdict if isinstance(cell, Marked) else _CLASSES.get(cell)
+    if marked:
+        return Markup(f' class="{marked}"')
     if len(cell) > 40:
         return Markup(' class="wide"')
     return Markup(' class="text"') if len(cell) > 12 and cell[0].isalpha() else Markup("")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.model import Marked, Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, note, number, pooled, spread
 from attnwarp_eval.report.compared import detectable_text, differences_of
 from attnwarp_eval.report.controls import UNCONTROLLED, outcomes_of
@@ -99,7 +99,7 @@ def _main(results: Results, ablation: Ablation, compared: Sequence[Comparison]) 
     """
     report, count = report_of(ablation.probe), len(results.study.scenes)
     verdicts = {
-        (one.b, one.metric): one.verdict
+        (one.b, one.metric): one
         for one in compared
         if one.contrast.scenes >= FEWEST_SCENES
         and any(one.contrast.by_scene.values())
@@ -118,11 +118,18 @@ def _main(results: Results, ablation: Ablation, compared: Sequence[Comparison]) 
             notes = [f" ({m.scenes} scenes)" * f for m, f in zip(means, few, strict=True)]
         shown = pooled if report.probe.metric(metric).squared else spread
         columns[title] = [
-            f"{shown(replace(mean, undefined=0))}{of} {verdicts.get((name, metric), '')}".strip()
+            _with_verdict(f"{shown(replace(mean, undefined=0))}{of}", verdicts.get((name, metric)))
             for name, mean, of in zip(names, means, notes, strict=True)
         ]
     rows = [list(row) for row in zip(*columns.values(), strict=True)]
     return Table(list(columns), rows, ablation.title)
+
+
+def _with_verdict(text: str, one: Comparison | None) -> str:
+    if one is None or not one.verdict:
+        return text
+    text = f"{text} {one.verdict}"
+    return Marked(text, one.word) if one.word in ("better", "worse") else text
 
 
 def in_detail(results: Results, compared: Sequence[Sequence[Comparison]]) -> list[Section]:

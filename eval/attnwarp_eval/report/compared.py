@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from attnwarp_eval.document.model import Marked
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.counted import COUNTED
 from attnwarp_eval.metrics.registry import Metric
@@ -203,7 +204,8 @@ def no_verdict(value: Contrast) -> str:
     sign = -1 if value.flips.mean < 0 else 1
     alike = sum(sign * one > value.flips.rounding for one in value.by_scene.values())
     scenes = f"{value.scenes} scene{'' if value.scenes == 1 else 's'}"
-    return f"{alike} of {scenes} {'lower' if sign < 0 else 'higher'}; no verdict"
+    text = f"{alike} of {scenes} {'lower' if sign < 0 else 'higher'}; no verdict"
+    return Marked(text, "untold")
 
 
 def detectable_text(value: Contrast) -> str:

@@ -13,7 +13,7 @@ from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import terminal, write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
-from attnwarp_eval.user_images.measure import Measured, Row, natural
+from attnwarp_eval.user_images.measure import Measured, Row, figures, natural
 
 if TYPE_CHECKING:
     import rich.table
@@ -149,7 +149,8 @@ def _by_view(measured: Measured) -> Table:
         [_line(name), *(_value(row, row.views[name]) if name in row.views else "" for row in own)]
         for name in names
     ]
-    return Table(["view", *(row.title.removesuffix(", mean of the views") for row in own)], rows)
+    titles = {figure.key: figure.title for figure in figures()}
+    return Table(["view", *(titles.get(row.key, row.title) for row in own)], rows)
 
 
 def _spec(row: Row) -> Metric:

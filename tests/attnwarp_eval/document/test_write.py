@@ -16,6 +16,7 @@ import pytest
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import (
     Gallery,
+    Marked,
     Picture,
     Report,
     Section,
@@ -69,6 +70,15 @@ def test_names_are_text_and_never_markup_or_columns(tmp_path):
             Parsed(page(report(name), tmp_path)).tags
             == Parsed(page(report("plain"), tmp_path)).tags
         )
+
+
+def test_only_a_marked_cell_has_the_colour_of_its_verdict(tmp_path):
+    table = Table(["figure"], [["no better"], [Marked("0.5 worse", "worse")]])
+    text = page(Report("title", [], [Section("a", [], [table])]), tmp_path)
+    assert re.findall(r"<td([^>]*)>([^<]*)", text) == [
+        ("", "no better"),
+        (' class="worse"', "0.5 worse"),
+    ]
 
 
 def test_a_page_holds_every_picture_and_nothing_from_elsewhere_in_8_mb(tmp_path):

@@ -19,11 +19,14 @@ MOST_STAGES = 3
 """Stages of an edit that the figure on depth edges shows."""
 
 DRIFTING = {
-    "ideal": ("ideal editor: parts with the source's answer", "parts.seen.edit"),
-    "editing": ("bundled editor: dE00 between views above the floor",
-                "multiview.delta_e_above.edit_inside"),
-}  # fmt: skip
-"""Probes of methods whose editor drifts: what is shown, and its metric."""
+    "ideal": ("ideal editor", "parts with the source's answer", "parts.seen.edit"),
+    "editing": (
+        "bundled editor",
+        "dE00 between views above the floor",
+        "multiview.delta_e_above.edit_inside",
+    ),
+}
+"""Probes of methods whose editor drifts: the editor, what is shown, and its metric."""
 
 
 @register_report
@@ -136,7 +139,7 @@ def _drift(results: Results, layout: Layout) -> Section:
     path, tables = layout.figure("drift.svg"), []
     shown = {probe: said for probe, said in DRIFTING.items() if results.finished(probe)}
     with charts.drawing(path, columns=len(shown), height=4.2, width=6.5 * len(shown)) as all_axes:
-        for axes, (probe, (title, key)) in zip(all_axes, shown.items(), strict=True):
+        for axes, (probe, (editor, what, key)) in zip(all_axes, shown.items(), strict=True):
             found: dict[str, dict[float, dict[str, dict[str, float]]]] = {}
             for cell, record in results.finished(probe):
                 shift = record.spec.get("drift", {"shift": 0.0})["shift"]
@@ -154,7 +157,6 @@ def _drift(results: Results, layout: Layout) -> Section:
                 for name, by in found.items()
             }
             series = [charts.Line(name, list(by), list(by.values())) for name, by in gains.items()]
-            editor, _, what = title.partition(": ")
             charts.lines(axes, series, x="planted shift, px", y=f"gain: {what}", title=editor)
             count = len(results.study.scenes)
             rows = [
@@ -169,7 +171,7 @@ def _drift(results: Results, layout: Layout) -> Section:
                 for name in found
             ]
             columns = ["method", *(f"{w}{s:g} px" for w in ("", "gain, ") for s in shifts)]
-            tables.append(Table(columns, rows, title))
+            tables.append(Table(columns, rows, f"{editor}: {what}"))
     text = (
         "An editor that moves every picture it edits by this shift, each view in a direction of its"
         f" own; pictures are of {results.study.size} px. Warps assume that it stays. **Gain**: the"

@@ -38,12 +38,15 @@ class CalibrationReport(ProbeReport):
 
     def problems(self, results: Results) -> list[str]:
         """One line a scene and figure; empty when the instrument is calibrated."""
-        lines = []
+        return [f"{scene}: {fault}" for scene, fault in self._faults(results)]
+
+    def _faults(self, results: Results) -> Iterator[tuple[str, str]]:
+        """Each scene that fails, once for each of its faults."""
         for cell in results.cells:
             if cell.probe != self.name:
                 continue
             if cell.record is None:
-                lines.append(f"{cell.scene}: the calibration was not measured")
+                yield cell.scene, "the calibration was not measured"
                 continue
             tests: list[tuple[str, Callable[[float], bool], str]] = [
                 ("warp.epe_median", lambda v: v < LARGEST_EPE, f"below {LARGEST_EPE:g} px"),
@@ -56,14 +59,11 @@ class CalibrationReport(ProbeReport):
             ]
             for metric, passes, expected in tests:
                 values = _values(cell.record, metric)
-                lines += [
-                    f"{cell.scene}: {metric} is {number(v)}, expected {expected}"
-                    for v in values
-                    if not passes(v)
-                ]
+                for value in values:
+                    if not passes(value):
+                        yield cell.scene, f"{metric} is {number(value)}, expected {expected}"
                 if not values:
-                    lines.append(f"{cell.scene}: {metric} is undefined in every view")
-        return lines
+                    yield cell.scene, f"{metric} is undefined in every view"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Sections on the calibration, and on the light transport of the scenes."""
@@ -74,7 +74,7 @@ class CalibrationReport(ProbeReport):
 
     def _calibration(self, results: Results) -> Section:
         sizes = results.study.feature_sizes
-        bad = self.problems(results)
+        failed = {scene for scene, _ in self._faults(results)}
         worst = {
             "warp.epe_median": max,
             "warp.epe_p95": max,
@@ -87,8 +87,7 @@ class CalibrationReport(ProbeReport):
         rows = []
         for cell, record in results.finished(self.name):
             figures = [_worst(record, metric, pick) for metric, pick in worst.items()]
-            passed = not any(line.startswith(f"{cell.scene}: ") for line in bad)
-            rows.append([cell.scene, "passed" if passed else "FAILED", *figures])
+            rows.append([cell.scene, "FAILED" if cell.scene in failed else "passed", *figures])
         columns = [
             "scene",
             "calibration",
