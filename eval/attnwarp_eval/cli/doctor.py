@@ -49,20 +49,13 @@ def doctor(
 
 def lines(check: Check) -> str:
     """Text lines of a check: its state and name, then the finding, the cost, and the remedy."""
-    text = textwrap.wrap(
-        f"{check.name}: {check.text}",
-        WIDTH,
-        initial_indent=f"{check.state:7}",
-        subsequent_indent=" " * 7,
-        break_on_hyphens=False,
+    paragraphs = [(f"{check.state:7}", " " * 7, f"{check.name}: {check.text}")]
+    for title, text in (("cost", check.cost), ("remedy", check.remedy)):
+        if text:
+            paragraphs.append((" " * 9, " " * 11, f"{title}: {text}"))
+    return "\n".join(
+        textwrap.fill(
+            text, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+        )
+        for first, rest, text in paragraphs
     )
-    for title, part in (("cost", check.cost), ("remedy", check.remedy)):
-        if part:
-            text += textwrap.wrap(
-                f"{title}: {part}",
-                WIDTH,
-                initial_indent=" " * 9,
-                subsequent_indent=" " * 11,
-                break_on_hyphens=False,
-            )
-    return "\n".join(text)

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata, util
 from typing import Literal
 
@@ -104,6 +104,16 @@ def cache() -> Check:
     return Check("cache", "ok", f"{folder}: {size / 1e9:.2f} of {limit / 1e9:g} GB")
 
 
+def _works(check: Check, program: str) -> Check:
+    """The check of a program that fails, at its cost, or ends; the last line that it prints takes
+    the place of ``text``.
+    """
+    printed, problem = _child(program)
+    if problem:
+        return replace(check, cost=f"{check.cost}: {problem}")
+    return Check(check.name, "ok", printed)
+
+
 def ray_casting() -> Check:
     """Open3D's ray casting, from which all truth comes."""
     program = """
@@ -113,18 +123,13 @@ o3d = open3d()
 scene = o3d.t.geometry.RaycastingScene()
 scene.add_triangles(np.float32([[0, 0, 2], [9, 0, 2], [0, 9, 2]]), np.uint32([[0, 1, 2]]))
 distance = float(scene.cast_rays(np.float32([[1, 1, 0, 0, 0, 1]]))["t_hit"].numpy()[0])
-print("works" if abs(distance - 2) < 1e-5 else f"a distance of {distance}, expected 2")
+assert abs(distance - 2) < 1e-5, f"a distance of {distance}, expected 2"
+print("Open3D casts rays")
 """
-    printed, problem = _child(program)
-    if printed == "works":
-        return Check("exact geometry", "ok", "Open3D casts rays")
-    return Check(
-        "exact geometry",
-        "broken",
-        "Open3D casts no rays",
-        f"no truth, so nothing can be measured: {problem or printed}",
-        f"apt install libegl1 libgl1 libx11-6 libgomp1, or again {install_command('eval')}",
-    )
+    cost = "no truth, so nothing can be measured"
+    remedy = f"apt install libegl1 libgl1 libx11-6 libgomp1, or again {install_command('eval')}"
+    failed = Check("exact geometry", "broken", "Open3D casts no rays", cost, remedy)
+    return _works(failed, program)
 
 
 def pictures() -> Check:
@@ -133,19 +138,15 @@ def pictures() -> Check:
 
     chosen = os.environ.get("ATTNWARP_MITSUBA")
     variant = llvm.variant()
-    program = f"import mitsuba; mitsuba.set_variant({variant!r}); print(mitsuba.variant())"
-    printed, problem = _child(program)
-    if printed != variant:
-        return Check(
-            "true pictures",
-            "broken",
-            f"Mitsuba does not start with {variant}",
-            f"no true picture can be made: {problem or printed}",
-            f"apt install libatomic1, or again {install_command('eval')}",
-        )
-    if variant == llvm.LLVM or chosen:
-        by = " by ATTNWARP_MITSUBA" if chosen else ""
-        return Check("true pictures", "ok", f"Mitsuba with {variant}{by}")
+    by = " by ATTNWARP_MITSUBA" if chosen else ""
+    text, cost = f"Mitsuba does not start with {variant}", "no true picture can be made"
+    remedy = f"apt install libatomic1, or again {install_command('eval')}"
+    check = _works(
+        Check("true pictures", "broken", text, cost, remedy),
+        f"import mitsuba; mitsuba.set_variant({variant!r}); print('Mitsuba with {variant}{by}')",
+    )
+    if check.state == "broken" or variant == llvm.LLVM or chosen:
+        return check
     return Check(
         "true pictures",
         "lack",
@@ -161,18 +162,12 @@ def window() -> Check:
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
 plotter.add_mesh(pyvista.Sphere(), color="red")
-print(int(plotter.screenshot(return_img=True).std() > 5))
+assert plotter.screenshot(return_img=True).std() > 5, "an empty picture"
+print("PyVista draws off screen; a window needs a display")
 """
-    printed, problem = _child(program)
-    if printed == "1":
-        return Check("3D window", "ok", "PyVista draws off screen; a window needs a display")
-    return Check(
-        "3D window",
-        "lack",
-        "PyVista draws nothing",
-        f"attnwarp-eval inspect does not run: {problem or printed}",
-        f"{install_command('inspect')}; apt install libegl1 libgl1",
-    )
+    cost = "attnwarp-eval inspect does not run"
+    remedy = f"{install_command('inspect')}; apt install libegl1 libgl1"
+    return _works(Check("3D window", "lack", "PyVista draws nothing", cost, remedy), program)
 
 
 def graphics_card() -> Check:
@@ -205,13 +200,10 @@ for name in small.bundled():
     small.check_sums(small.WEIGHTS / name)
 for name in BUNDLED:
     load_encoder(name)
-print(", ".join([*BUNDLED, *small.bundled()]))
+print(", ".join([*BUNDLED, *small.bundled()]) + ": every checksum fits")
 """
-    printed, problem = _child(program)
-    if problem:
-        remedy = "install attnwarp again"
-        return Check("bundled weights", "broken", "damaged or missing", problem, remedy)
-    return Check("bundled weights", "ok", f"{printed}: every checksum fits")
+    cost, remedy = "what is bundled cannot be loaded", "install attnwarp again"
+    return _works(Check("bundled weights", "broken", "damaged or missing", cost, remedy), program)
 
 
 def _child(program: str) -> tuple[str, str]:
