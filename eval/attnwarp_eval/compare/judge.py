@@ -1,14 +1,14 @@
 """Verdicts of a run against a baseline. Pure: two snapshots in, one comparison out.
 
 Two cells of one definition and one seed are the same computation, so their figures are compared
-view by view. Cells with different seeds are samples, and the difference is tested over scenes,
-with the p-values of all tests adjusted together.
+view by view. A change within the margin is tested over scenes, with the p-values of all tests
+adjusted together.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -32,9 +32,6 @@ FEWEST_SCENES = 6
 """Fewest pairs of scenes with which a test can flag a difference."""
 
 NOT_IN_STUDY = "not in the run's study"
-
-SEVERAL_VIEWS = 3
-"""Number of a scene's views that are unlikely to be all undefined by a change of seed."""
 
 FaultKind = Literal["missing", "unmeasured", "redefined", "counter"]
 
@@ -68,9 +65,9 @@ class Row:
         adjusted_p: p-value of the difference, adjusted for all tests of the comparison; NaN without
             a test.
         worst: the view with the largest worsening (``scene/view/seed``), with its two values.
-        undefined: views whose value was defined in the baseline only, for any seed.
-        beyond_margin: views of the same seed that got worse by more than the metric's margin; one
-            is enough for "worse", regardless of the mean.
+        undefined: views whose value was defined in the baseline only.
+        beyond_margin: views that got worse by more than the metric's margin; one is enough for
+            "worse", regardless of the mean.
     """
 
     probe: str
@@ -92,8 +89,6 @@ class Comparison:
 
     Attributes:
         study: name of the run's study.
-        exact: whether both sides have the same seeds, so that views are compared one by one.
-        scenes: number of scenes of the most widely compared figure; hard cases do not count.
         rows: one for each (probe, variant, metric) on both sides.
         faults: failures without a figure.
         added: figures and counters that only the run has; they pass until ``--update`` adds them to
@@ -103,8 +98,6 @@ class Comparison:
     """
 
     study: str
-    exact: bool
-    scenes: int
     rows: tuple[Row, ...]
     faults: tuple[Fault, ...]
     added: tuple[str, ...] = field(default=())
@@ -127,11 +120,6 @@ class Comparison:
         """Reason why there is no verdict; empty if there is one."""
         if not self.rows:
             return "both sides share no gated figure"
-        if not self.exact and self.scenes < FEWEST_SCENES:
-            return (
-                f"the seeds differ, and a test over {self.scenes} scenes says nothing; expected at"
-                f" least {FEWEST_SCENES}, or the baseline's seeds"
-            )
         if self.unread:
             return (
                 f"both sides share no gated figure of {', '.join(map(repr, self.unread))}; gate on"
@@ -140,8 +128,8 @@ class Comparison:
         return ""
 
 
-Key = tuple[str, ...]
-"""(scene, probe, variant), followed by the seed if both sides have the same seeds."""
+Key = tuple[str, str, str, str]
+"""(scene, probe, variant, seed)."""
 
 
 def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparison:
@@ -151,15 +139,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     then no fault, and is listed in ``left_out``.
     """
     left_out: list[str] = []
-    if common and (seeds := baseline.seeds & run.seeds):
-        for where, side in (("baseline", baseline), ("run", run)):
-            if own := sorted(side.seeds - seeds):
-                numbers = ", ".join(map(str, own))
-                left_out.append(f"{_plural('seed', own)} {numbers} (only in the {where})")
-        baseline, run = (_of_seeds(side, seeds) for side in (baseline, run))
-    exact = baseline.seeds == run.seeds
-    left, right = _by_key(baseline.cells, exact), _by_key(run.cells, exact)
-    faults, added = _missing_cells(left, right, run, exact)
+    left, right = _by_key(baseline.cells), _by_key(run.cells)
+    faults, added = _missing_cells(left, right, run)
     for key in sorted(left.keys() & right.keys()):
         first, second = left[key], right[key]
         name = _name(key)
@@ -170,17 +151,14 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
                 del left[key], right[key]
                 continue
             faults.append(Fault("redefined", name, detail))
-        if exact:
-            faults += _counters(name, first[0].counters, second[0].counters)
-            new = sorted(second[0].counters.keys() - first[0].counters.keys())
-            added += [f"{name} / {counter}" for counter in new]
+        before, now = _counted(first), _counted(second)
+        faults += _counters(name, before, now)
+        added += [f"{name} / {counter}" for counter in sorted(now.keys() - before.keys())]
         first, second = left[key], right[key] = _without_psnr(first, second)
         missing, new = _missing_figures(name, first, second)
         faults += missing
         added += new
-    rows = _rows(left, right, exact)
-    scenes = [row.difference.scenes for row in rows if probe_of(row.probe).needs_scenes]
-    most = max(scenes, default=0)
+    rows = _rows(left, right)
     both = {probe for _, probe, *_ in left.keys() & right.keys()}
     # A plugin's probe has figures without gates: none of them was dropped.
     unread = sorted(name for name in both - {r.probe for r in rows} if _has_gates(name))
@@ -190,16 +168,7 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
         left_out += [f"{fault.name} ({fault.detail})" for fault in lacking]
         left_out += [f"{name} (only in the run)" for name in added]
         added = []
-    return Comparison(
-        run.study, exact, most, rows, tuple(faults), tuple(added), tuple(unread), tuple(left_out)
-    )
-
-
-def _of_seeds(side: Snapshot, seeds: Set[int]) -> Snapshot:
-    """The cells of some seeds."""
-    cells = [cell for cell in side.cells if cell.seed in seeds]
-    missing = {key: reason for key, reason in side.missing.items() if key[3] in seeds}
-    return replace(side, cells=tuple(cells), missing=missing)
+    return Comparison(run.study, rows, tuple(faults), tuple(added), tuple(unread), tuple(left_out))
 
 
 def _has_gates(name: str) -> bool:
@@ -207,14 +176,15 @@ def _has_gates(name: str) -> bool:
     return not GATES.keys().isdisjoint(m.name for m in probe_of(name).metrics.values())
 
 
-def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:
-    """The cells of every key; shared cells are repeated, since variants may diverge."""
+def _by_key(cells: Iterable[Measured]) -> dict[Key, list[Measured]]:
+    """The cells of every key, one for each edit; shared ones are repeated, since variants may
+    diverge.
+    """
     table: dict[Key, list[Measured]] = {}
     for cell in cells:
         for variant in cell.variants:
-            table.setdefault(_key(cell.scene, cell.probe, variant, cell.seed, exact), []).append(
-                cell
-            )
+            key = (cell.scene, cell.probe, variant, str(cell.seed))
+            table.setdefault(key, []).append(cell)
     return table
 
 
@@ -238,21 +208,17 @@ def _without_psnr(
     return kept(first), kept(second)
 
 
-def _key(scene: str, probe: str, variant: str, seed: int, exact: bool) -> Key:
-    return (scene, probe, variant, str(seed)) if exact else (scene, probe, variant)
-
-
 def _name(key: Key) -> str:
-    return " / ".join((*key[:3], *(f"seed {seed}" for seed in key[3:])))
+    return " / ".join((*key[:3], f"seed {key[3]}"))
 
 
 def _missing_cells(
-    left: Mapping[Key, object], right: Mapping[Key, object], run: Snapshot, exact: bool
+    left: Mapping[Key, object], right: Mapping[Key, object], run: Snapshot
 ) -> tuple[list[Fault], list[str]]:
     reasons: dict[Key, str] = dict.fromkeys(left.keys() - right.keys(), NOT_IN_STUDY)
     # A run that lacks one of its expected cells is incomplete, regardless of the baseline.
     for (scene, probe, variant, seed), reason in run.missing.items():
-        reasons[_key(scene, probe, variant, seed, exact)] = reason
+        reasons[scene, probe, variant, str(seed)] = reason
     only_here = dict.fromkeys(right.keys() - left.keys(), "")
     return _lacking(reasons, right), [fault.name for fault in _lacking(only_here, left)]
 
@@ -269,13 +235,9 @@ def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fa
     """
     rest, faults = dict(lacking), []
     for place, what in enumerate(_WHOLE):
-        has = {key[place] for key in there if place < len(key)}
+        has = {key[place] for key in there}
         for reason in _NOT_FAILED:
-            keys = [
-                key
-                for key, why in rest.items()
-                if place < len(key) and key[place] not in has and why == reason
-            ]
+            keys = [key for key, why in rest.items() if key[place] not in has and why == reason]
             names = sorted({key[place] for key in keys})
             if keys:
                 cells = f"{len(keys)} {_plural('cell', keys)}"
@@ -288,6 +250,15 @@ def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fa
 
 def _plural(word: str, counted: Collection[object]) -> str:
     return word if len(counted) == 1 else f"{word}s"
+
+
+def _counted(cells: Iterable[Measured]) -> dict[str, int]:
+    """Counts of work over cells."""
+    counts: dict[str, int] = {}
+    for cell in cells:
+        for name, count in cell.counters.items():
+            counts[name] = counts.get(name, 0) + count
+    return counts
 
 
 def _counters(name: str, first: Mapping[str, int], second: Mapping[str, int]) -> list[Fault]:
@@ -342,7 +313,7 @@ def _metrics(cells: list[Measured]) -> set[str]:
 
 
 def _rows(
-    left: Mapping[Key, list[Measured]], right: Mapping[Key, list[Measured]], exact: bool
+    left: Mapping[Key, list[Measured]], right: Mapping[Key, list[Measured]]
 ) -> tuple[Row, ...]:
     shared: dict[tuple[str, str], list[Key]] = {}
     for key in sorted(left.keys() & right.keys()):
@@ -356,23 +327,22 @@ def _rows(
         }
     )
     groups = [
-        _Group.of(probe, variant, metric, shared[probe, variant], left, right, exact)
+        _Group.of(probe, variant, metric, shared[probe, variant], left, right)
         for probe, variant, metric in names
     ]
     # Exclude tests with too few scenes, which would reduce the power of the others.
     adjusted = benjamini_hochberg(
         [g.difference.p if g.difference.scenes >= FEWEST_SCENES else math.nan for g in groups]
     )
-    return tuple(g.row(p, exact) for g, p in zip(groups, adjusted, strict=True))
+    return tuple(g.row(p) for g, p in zip(groups, adjusted, strict=True))
 
 
 @dataclass(frozen=True)
 class _Group:
-    """The values of one metric of one variant on both sides, by scene and view (and seed).
+    """The values of one metric of one variant on both sides, by scene, view and seed.
 
     Attributes:
         before, now: measured values.
-        gaps: whether any value of a view and seed is undefined.
         worsening: scene/view -> worsening of the run, in the metric's unit.
     """
 
@@ -383,7 +353,6 @@ class _Group:
     before: ByView
     now: ByView
     difference: Interval
-    gaps: bool
     worsening: Mapping[str, float]
 
     @classmethod
@@ -395,10 +364,9 @@ class _Group:
         shared: list[Key],
         left: Mapping[Key, list[Measured]],
         right: Mapping[Key, list[Measured]],
-        exact: bool,
     ) -> _Group:
         metric = METRICS[key]
-        before, now = (_values(side, shared, key, exact) for side in (left, right))
+        before, now = (_values(side, shared, key) for side in (left, right))
         size = abs if metric.direction == "zero" else float
         first, second = (
             {s: {v: float(size(x)) for v, x in views.items()} for s, views in side.items()}
@@ -411,11 +379,9 @@ class _Group:
             for view, value in views.items()
             if view in second.get(scene, {})
         }
-        gaps = _any_undefined(left, shared, key) or _any_undefined(right, shared, key)
-        difference = paired(first, second)
-        return cls(probe, variant, metric, key, before, now, difference, gaps, worsening)
+        return cls(probe, variant, metric, key, before, now, paired(first, second), worsening)
 
-    def row(self, adjusted_p: float, exact: bool) -> Row:
+    def row(self, adjusted_p: float) -> Row:
         """The group's verdict."""
         flat_before, flat_now = _flat(self.before), _flat(self.now)
         undefined = sum(
@@ -424,26 +390,25 @@ class _Group:
         )
         defined = {name: w for name, w in self.worsening.items() if math.isfinite(w)}
         worst = max(defined, key=lambda name: defined[name], default=None)
-        judged = self._exactly(flat_before, undefined) if exact else None
         return Row(
             self.probe,
             self.variant,
             self.key,
-            judged or self._by_scenes(flat_before, adjusted_p),
+            self._by_views(flat_before, undefined) or self._by_scenes(flat_before, adjusted_p),
             *_means_of_shared(self.before, self.now),
             self.difference,
             adjusted_p,
             (worst, flat_before[worst], flat_now[worst]) if worst else None,
             undefined,
-            self._beyond_margin(flat_before) if exact else 0,
+            self._beyond_margin(flat_before),
         )
 
     def _beyond_margin(self, before: Mapping[str, float]) -> int:
         limit = margin(self.key)
         return sum(w > limit.around(before[name]) for name, w in self.worsening.items())
 
-    def _exactly(self, before: Mapping[str, float], undefined: int) -> Verdict | None:
-        """The verdict on equal computations, view by view; None if only a test can decide."""
+    def _by_views(self, before: Mapping[str, float], undefined: int) -> Verdict | None:
+        """The verdict view by view; None if only a test can decide."""
         allowed = Margin(self.metric.atol, self.metric.rtol)
         limit = margin(self.key)
         if undefined or self._beyond_margin(before):
@@ -462,23 +427,9 @@ class _Group:
         lost = any(w > tolerance for w, tolerance, _ in changes)
         return "better" if gained and not lost else None
 
-    def _lost(self) -> bool:
-        """True if the run defines the figure nowhere, or in none of several views of a scene.
-
-        The seeds decide which single views define the figure.
-        """
-        defined = {s: sum(map(math.isfinite, v.values())) for s, v in self.before.items()}
-        left = {s: sum(map(math.isfinite, v.values())) for s, v in self.now.items()}
-        gone = [views for scene, views in defined.items() if views and not left.get(scene)]
-        if not gone:
-            return False
-        return max(gone) >= SEVERAL_VIEWS or len(gone) == sum(map(bool, defined.values()))
-
     def _by_scenes(self, before: Mapping[str, float], adjusted_p: float) -> Verdict:
-        """The verdict of a test over scenes; a lost figure needs no test."""
+        """The verdict of a test over scenes."""
         difference = self.difference
-        if self._lost():
-            return "worse"
         if difference.scenes < FEWEST_SCENES:
             return "can't tell"
         values = [value for value in before.values() if math.isfinite(value)]
@@ -491,31 +442,22 @@ class _Group:
         )
         reach = float(np.mean([margin(self.key).around(value) for value in values]))
         within = max(abs(difference.low), abs(difference.high)) < reach
-        if outcome == "can't tell" and within and not self.gaps and not difference.undefined:
+        if outcome == "can't tell" and within and not difference.undefined:
             return "equal"
         return outcome
 
 
 def _values(
-    side: Mapping[Key, list[Measured]], keys: list[Key], metric: str, exact: bool
+    side: Mapping[Key, list[Measured]], keys: list[Key], metric: str
 ) -> dict[str, dict[str, float]]:
-    """Scene -> view (and seed) -> value; the mean over the defined seeds if seeds differ."""
-    table: dict[str, dict[str, list[float]]] = {}
+    """Scene -> view and seed -> value."""
+    table: dict[str, dict[str, float]] = {}
     for key in keys:
         for cell in side[key]:
             figure = cell.figures.get(metric)
             for view, value in figure.values.items() if figure else ():
-                name = f"{view}/{cell.seed}" if exact else view
-                table.setdefault(key[0], {}).setdefault(name, []).append(value)
-    return {
-        scene: {view: _mean_of_defined(values) for view, values in views.items()}
-        for scene, views in table.items()
-    }
-
-
-def _any_undefined(side: Mapping[Key, list[Measured]], keys: list[Key], metric: str) -> bool:
-    figures = (cell.figures.get(metric) for key in keys for cell in side[key])
-    return any(math.isnan(v) for figure in figures if figure for v in figure.values.values())
+                table.setdefault(key[0], {})[f"{view}/{cell.seed}"] = value
+    return table
 
 
 def _flat(table: ByView) -> dict[str, float]:

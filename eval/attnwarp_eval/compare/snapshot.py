@@ -67,11 +67,6 @@ class Snapshot:
     cells: tuple[Measured, ...]
     missing: Mapping[tuple[str, str, str, int], str] = field(default_factory=dict)
 
-    @property
-    def seeds(self) -> frozenset[int]:
-        """Seeds of the expected cells."""
-        return frozenset(cell.seed for cell in self.cells) | {key[3] for key in self.missing}
-
 
 def read_snapshot(store: Store) -> Snapshot:
     """The snapshot of a run's folder, read by the report's reader.

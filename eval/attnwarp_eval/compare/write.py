@@ -53,7 +53,7 @@ def summary(comparison: Comparison) -> str:
 
 def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
     """The comparison as a document: faults first, then every verdict except "equal"."""
-    lead = [f"**{summary(comparison)}**", *(f"**Note**: {n}." for n in notes), _method(comparison)]
+    lead = [f"**{summary(comparison)}**", *(f"**Note**: {n}." for n in notes), METHOD]
     if comparison.too_little:
         lead.append(f"Too little to compare: {comparison.too_little}.")
     sections = []
@@ -151,19 +151,12 @@ def as_json(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]
     )
 
 
-def _method(comparison: Comparison) -> str:
-    if comparison.exact:
-        return (
-            "Same seeds on both sides: a view that got worse by more than its metric's margin is a"
-            " regression, smaller changes are tested over the scenes. Counters must be the same,"
-            " those behind rounded numbers within 0.1 %;"
-            ' seconds are not compared. "can\'t tell" is not "equal".'
-        )
-    return (
-        "Other seeds: differences are paired on scene and view and tested over the scenes, with"
-        " p-values adjusted for all tests (Benjamini & Hochberg). Counters and seconds are not"
-        ' compared. "can\'t tell" is not "equal".'
-    )
+METHOD = (
+    "A view that got worse by more than its metric's margin is a regression, smaller changes are"
+    " tested over the scenes. Counters must be the same, those behind rounded numbers within 0.1 %;"
+    ' seconds are not compared. "can\'t tell" is not "equal".'
+)
+"""Description of a comparison for a report."""
 
 
 def _section(title: str, columns: list[str], rows: list[list[str]]) -> Section:
