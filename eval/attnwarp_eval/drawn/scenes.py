@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.drawn import asked
-from attnwarp_eval.drawn.assemblies import KINDS, USUAL, Assembly
+from attnwarp_eval.drawn.assemblies import KINDS, USUAL, pieces
 from attnwarp_eval.drawn.axes import Axes, to_words
 from attnwarp_eval.drawn.draft import (
     GENERATOR,
@@ -197,9 +197,8 @@ class SceneDraft(Draft):
         scale: float,
         yaw: float,
     ) -> Thing:
-        pieces = Assembly(KINDS.index(kind), instance, 0).pieces()
         objects = []
-        for k, (name, parts) in enumerate(pieces.items()):
+        for k, (name, parts) in enumerate(pieces(kind, instance).items()):
             shape = {
                 "type": "body", "parts": plain_numbers(parts), "blend": 0.03, "resolution": 48,
                 "yaw": yaw, "scale": scale,

@@ -13,7 +13,6 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.editing.editor import Image, edit
-from attnwarp_eval.drawn.worlds import sentence
 from training.assess.editors import SEED
 from training.assess.figures import Figure, figure
 from training.assess.judge import nearest
@@ -21,6 +20,7 @@ from training.assess.pictures import Row
 from training.editors.depth import Prompts, attributes_of
 from training.editors.net import TOKENS
 from training.worlds.editing_pairs import GROUPS, load_pairs
+from training.worlds.words import sentence
 
 STEPS = 20
 

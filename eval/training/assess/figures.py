@@ -15,24 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders.base import Image, PerceptualDistance, TextImageEncoder, TokenEncoder
-from attnwarp_eval.drawn.worlds import (
-    COLORS,
-    FINISHES,
-    GROUNDS,
-    HOURS,
-    NOUNS,
-    OBJECTS,
-    PLACES,
-    TIMES,
-    attributes,
-    draw_look,
-    draw_world,
-    sentence,
-)
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, HOURS, OBJECTS, PLACES, TIMES
 from training.encoders.clip import true_of
 from training.encoders.distort import HELD_OUT_KINDS, TRAIN_KINDS
 from training.encoders.perceptual import HELD_OUT_PHOTOS, Sources, photographs, triple
 from training.worlds.data import SIZE, SPLITS, Pictures, load, looks_of
+from training.worlds.draw import attributes, draw_look, draw_world
+from training.worlds.words import NOUNS, sentence
 
 Array = npt.NDArray[np.float64]
 

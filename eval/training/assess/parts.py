@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders.base import TextImageEncoder
-from attnwarp_eval.drawn.assemblies import KINDS, WHOLE_NOUNS
-from attnwarp_eval.drawn.worlds import draw_look
+from attnwarp_eval.drawn.assemblies import KINDS
 from training.assess.figures import Figure, as_float, figure, unit
 from training.encoders.clip_parts import surface_choices, surface_number
+from training.worlds.assemblies import WHOLE_NOUNS
+from training.worlds.draw import draw_look
 from training.worlds.part_captions import (
     Caption,
     Surface,

@@ -20,7 +20,6 @@ from tokenizers import Tokenizer
 
 from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
-from attnwarp_eval.drawn.worlds import sentence
 from training.assess.pictures import Pictures, Row
 from training.editors.answers import codes
 from training.editors.net import (
@@ -49,6 +48,7 @@ from training.worlds.editing_pairs import (
     load_pairs,
     scene_edits,
 )
+from training.worlds.words import sentence
 
 Tensor = torch.Tensor
 
@@ -138,7 +138,7 @@ def reserved_prompts() -> frozenset[str]:
 
 
 def attributes_of(worlds: Worlds, world: int) -> npt.NDArray[np.int64]:
-    """(LOOKS, 6) attributes of a world's looks, in the order of :func:`attnwarp_eval.drawn.worlds.attributes`."""
+    """(LOOKS, 6) attributes of a world's looks, in the order of :func:`training.worlds.draw.attributes`."""
     thing = np.full((LOOKS, 1), worlds.things[world])
     return np.concatenate([thing, worlds.looks[world]], axis=1)
 

@@ -16,21 +16,13 @@ from tokenizers import Tokenizer
 from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipSmall
-from attnwarp_eval.drawn.worlds import (
-    COLORED,
-    COLORS,
-    FINISHES,
-    GROUNDS,
-    OBJECTS,
-    TIMES,
-    TWO_COLORED,
-    captioned,
-    sentence,
-)
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED
 from training.common import Run, channels_last, crops, descend, groups, rate, settings
 from training.encoders import naming
 from training.encoders.byte_pairs import learn_byte_pairs, tokens_of
 from training.encoders.naming import Heads, pictures_of, scrambled, warm_start
+from training.worlds.draw import COLORED
+from training.worlds.words import captioned, sentence
 
 SEED = 1
 EPOCHS = 8

@@ -19,27 +19,18 @@ from tokenizers import Tokenizer
 from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipParts
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
-from attnwarp_eval.drawn.worlds import (
-    COLORS,
-    FINISHES,
-    GROUNDS,
-    HOURS,
-    PLACES,
-    STATUES,
-    TIMES,
-    captioned,
-    one_of,
-    sentence,
-)
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, HOURS, PLACES, STATUES, TIMES
 from training.common import Run, channels_last, descend, groups, placed_crops, rate, settings
 from training.encoders import clip, naming
 from training.encoders.byte_pairs import tokens_of
 from training.encoders.clip import contrast, naming_loss
 from training.worlds import part_captions, part_pictures
+from training.worlds.assemblies import WHOLE_NOUNS
 from training.worlds.data import load as load_pictures
 from training.worlds.part_captions import caption_of, part_words, true_of, with_article, wrong
 from training.worlds.part_pictures import GROUND, OTHER, PARTS, SHARD, SKY, PartPictures, shares_of
+from training.worlds.words import captioned, one_of, sentence
 
 SEED = 7
 EPOCHS = 36

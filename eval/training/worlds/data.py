@@ -15,18 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.io.file import write_atomically
-from attnwarp_eval.drawn.worlds import (
-    FINISHES,
-    GROUNDS,
-    OBJECTS,
-    TIMES,
-    TRAIN_SHAPES,
-    Look,
-    attributes,
-    change,
-    draw_look,
-    draw_world,
-)
+from attnwarp_eval.drawn.worlds import FINISHES, GROUNDS, OBJECTS, TIMES, Look
+from training.worlds.draw import TRAIN_SHAPES, attributes, change, draw_look, draw_world
 
 DATA_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""
@@ -46,7 +36,7 @@ class Split:
         pairs: colours of the objects: "seen" in training, "new", or "any".
         new_shapes: whether the shapes are ones that training never sees.
         own_shapes: whether every world has a shape of its own, which training may see; else worlds
-            share :data:`attnwarp_eval.drawn.worlds.TRAIN_SHAPES` of each thing.
+            share :data:`training.worlds.draw.TRAIN_SHAPES` of each thing.
         path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the
             ray caster (two views of each look).
         moved: whether all looks of a world have its surface, on other grounds at other times; else
@@ -89,7 +79,7 @@ class Pictures:
 
     Attributes:
         images: (N, size, size, 3) uint8 sRGB.
-        attributes: (N, 6) as :data:`attnwarp_eval.drawn.worlds.ATTRIBUTES`.
+        attributes: (N, 6) as :data:`training.worlds.draw.ATTRIBUTES`.
         world: (N,) seed of the world.
         view: (N,) which of its cameras.
         look: (N,) which of its looks; 1 differs from 0 in one attribute, 2 in everything that was

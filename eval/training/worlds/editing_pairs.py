@@ -17,37 +17,24 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.io.file import write_atomically
-from attnwarp_eval.drawn.assemblies import (
-    KINDS,
-    PART_NOUNS,
-    USUAL,
-    WHOLE,
-    WHOLE_NOUNS,
-    Assembly,
-    draw_assembly,
-)
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, USUAL
 from attnwarp_eval.drawn.worlds import (
     COLORS,
     FINISHES,
     GROUNDS,
     HOURS,
-    HUES,
-    NOUNS,
     OBJECTS,
     PLACES,
     STATUES,
     TIMES,
-    TRAIN_SHAPES,
     Look,
-    World,
-    draw_look,
-    draw_world,
     held_out,
-    one_of,
-    surface_words,
 )
 from attnwarp_eval.scene.yaml import read_yaml
+from training.worlds.assemblies import WHOLE, WHOLE_NOUNS, Assembly, draw_assembly
 from training.worlds.data import render_missing
+from training.worlds.draw import TRAIN_SHAPES, World, draw_look, draw_world
+from training.worlds.words import HUES, NOUNS, one_of, surface_words
 
 PAIRS_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""

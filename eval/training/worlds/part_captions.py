@@ -11,24 +11,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
 from attnwarp_eval.drawn.worlds import (
     COLORS,
-    FILLERS,
     FINISHES,
     GROUNDS,
     HOURS,
-    HUES,
-    OPENINGS,
     PLACES,
     STATUES,
     TIMES,
     TWO_COLORED,
-    draw_look,
-    one_of,
-    surface_words,
 )
+from training.worlds.assemblies import WHOLE_NOUNS
+from training.worlds.draw import draw_look
 from training.worlds.part_pictures import PARTS, PartPictures
+from training.worlds.words import FILLERS, HUES, OPENINGS, one_of, surface_words
 
 Surface = tuple[int, int, int]
 """Finish, color, second; -1 where nothing is said. A colour without a finish is true of plain and shiny ones."""

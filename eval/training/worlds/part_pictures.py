@@ -15,9 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.io.file import write_atomically
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, Assembly, draw_assembly
-from attnwarp_eval.drawn.worlds import OBJECTS, Look, draw_look, held_out
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
+from attnwarp_eval.drawn.worlds import OBJECTS, Look, held_out
+from training.worlds.assemblies import Assembly, draw_assembly
 from training.worlds.data import SIZE, joined, render_missing
+from training.worlds.draw import draw_look
 
 PARTS_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""

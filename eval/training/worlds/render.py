@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.drawn.worlds import FINISHES, Look, World
+from attnwarp_eval.drawn.worlds import FINISHES, Look
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec, SkySpec, SunSpec
@@ -20,6 +20,7 @@ from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.raycast import Hits
 from attnwarp_eval.truth.shading import hemisphere, sky_radiance, sun_direction
+from training.worlds.draw import World
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]

@@ -10,20 +10,13 @@ import pytest
 from scipy.stats import binom, binomtest
 
 from attnwarp_eval.drawn import worlds
-from attnwarp_eval.drawn.worlds import (
-    COLORED,
-    COLORS,
-    FINISHES,
-    GROUNDS,
-    OBJECTS,
-    TIMES,
-    TWO_COLORED,
-)
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED
 from training.assess import figures as assess
 from training.assess.figures import figure
 from training.encoders.perceptual import triple
-from training.worlds import render
+from training.worlds import render, words
 from training.worlds.data import SIZE, Pictures
+from training.worlds.draw import COLORED
 
 SETS = ("test", "test-new-pairs", "test-rendered")
 
@@ -139,8 +132,8 @@ def number(image):
 WORDS = {
     **{phrase: ("ground", g) for g, said in worlds.PLACES.items() for phrase in said},
     **{phrase: ("time", t) for t, said in worlds.HOURS.items() for phrase in said},
-    **{phrase: ("object", o) for o, said in worlds.NOUNS.items() for phrase in said},
-    **{phrase: ("color", c) for c, said in worlds.HUES.items() for phrase in said},
+    **{phrase: ("object", o) for o, said in words.NOUNS.items() for phrase in said},
+    **{phrase: ("color", c) for c, said in words.HUES.items() for phrase in said},
     **{"polar": ("color", "white"), "grizzly": ("color", "brown")},
     **{f: ("finish", f) for f in FINISHES if f != "plain"},
     **{f: ("finish", "shiny") for f in ("glossy", "plastic", "polished")},

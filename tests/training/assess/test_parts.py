@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
-from attnwarp_eval.drawn.worlds import COLORS, FINISHES, HUES, STATUES
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, STATUES
 from training.assess import parts as part_assess
+from training.worlds.assemblies import WHOLE_NOUNS
 from training.worlds.part_captions import SOME_HUES
 from training.worlds.part_pictures import LOOKS, PARTS, PartPictures
+from training.worlds.words import HUES
 
 ADJECTIVES = {
     **{word: color for color, words in HUES.items() for word in words},

@@ -10,7 +10,7 @@ from diffusers import StableDiffusionControlNetPipeline
 from attnwarp.editing.editor import edit
 from attnwarp.editing.editors.controlnet import DepthControlNet, control_image
 from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
-from attnwarp_eval.drawn.worlds import COLORS, HUES
+from attnwarp_eval.drawn.worlds import COLORS
 from training import steps
 from training.assess.depth import assess_depth, depth_card, separation
 from training.assess.pictures import Row
@@ -28,6 +28,7 @@ from training.editors.export import export_depth_editor
 from training.editors.net import EditorNet
 from training.editors.recipe import make_tokenizer
 from training.worlds.editing_pairs import LOOKS, PAIR_SPLITS, SIZE, THING, Worlds, edit_looks
+from training.worlds.words import HUES
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
 

@@ -6,7 +6,7 @@ import torch
 from small_trainings import stopped_at
 
 from attnwarp.encoders.nets import ClipSmall
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, OBJECTS
 from training.encoders import clip, clip_parts
 from training.encoders.clip_parts import (
@@ -18,6 +18,7 @@ from training.encoders.clip_parts import (
     surface_number,
 )
 from training.worlds import part_pictures
+from training.worlds.assemblies import WHOLE_NOUNS
 from training.worlds.data import Pictures
 from training.worlds.part_pictures import (
     GROUND,

@@ -6,27 +6,13 @@ import numpy as np
 import pytest
 
 import attnwarp_eval
-from attnwarp_eval.drawn.assemblies import (
-    KINDS,
-    PART_NOUNS,
-    USUAL,
-    WHOLE,
-    WHOLE_NOUNS,
-    Assembly,
-    draw_assembly,
-)
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, USUAL
 from attnwarp_eval.drawn.objects import RECIPES, body, plain_numbers
-from attnwarp_eval.drawn.worlds import (
-    COLORS,
-    FINISHES,
-    HELD_OUT_SHAPE,
-    NOUNS,
-    OBJECTS,
-    TRAIN_SHAPES,
-    Look,
-)
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, OBJECTS, Look
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.yaml import read_yaml
+from training.worlds.assemblies import WHOLE, WHOLE_NOUNS, Assembly, draw_assembly
+from training.worlds.draw import HELD_OUT_SHAPE, TRAIN_SHAPES
 from training.worlds.editing_pairs import (
     GROUPS,
     PAIR_SPLITS,
@@ -41,6 +27,7 @@ from training.worlds.editing_pairs import (
     thing_of,
 )
 from training.worlds.render import pictures
+from training.worlds.words import NOUNS
 
 SHAPE = ("center", "radii", "start", "end", "points", "radius", "height", "size")
 

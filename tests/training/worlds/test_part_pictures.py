@@ -5,19 +5,19 @@ import re
 import numpy as np
 import pytest
 
-from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
+from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS
 from attnwarp_eval.drawn.worlds import (
     COLORS,
     FINISHES,
     GROUNDS,
-    HELD_OUT_SHAPE,
-    HUES,
     OBJECTS,
     STATUES,
     TIMES,
     TWO_COLORED,
     held_out,
 )
+from training.worlds.assemblies import WHOLE_NOUNS
+from training.worlds.draw import HELD_OUT_SHAPE
 from training.worlds.editing_pairs import PAIR_SPLITS, reserved
 from training.worlds.part_captions import (
     Caption,
@@ -41,6 +41,7 @@ from training.worlds.part_pictures import (
     part_world,
     render_part_world,
 )
+from training.worlds.words import HUES
 
 SPLIT = PartSplit(95_000_000, 17)
 """Seeds that no recipe uses."""

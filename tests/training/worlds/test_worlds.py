@@ -10,28 +10,16 @@ import pytest
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.drawn import worlds
 from attnwarp_eval.drawn.objects import RECIPES, body
-from attnwarp_eval.drawn.worlds import (
-    COLORS,
-    FINISHES,
-    GROUNDS,
-    OBJECTS,
-    TIMES,
-    Look,
-    attributes,
-    captioned,
-    change,
-    draw_look,
-    draw_world,
-    held_out,
-    sentence,
-)
+from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, Look, held_out
 from attnwarp_eval.truth.mitsuba import render_plan
 from attnwarp_eval.truth.plan import plan
 from training.editors.depth import reserved_prompts
 from training.encoders.clip import make_tokenizer, true_of, wrong
-from training.worlds import render
+from training.worlds import render, words
 from training.worlds.data import SPLITS, looks_of
+from training.worlds.draw import HELD_OUT_SHAPE, attributes, change, draw_look, draw_world
 from training.worlds.editing_pairs import reserved
+from training.worlds.words import captioned, sentence
 
 
 def _look(rng, **said):
@@ -86,16 +74,16 @@ def captions_pattern():
     def every(table):
         return one(word for words in table.values() for word in words)
 
-    hue = every(worlds.HUES)
+    hue = every(words.HUES)
     surface = (
         f"(?:{hue}|(?:shiny|glossy|polished) {hue}|{hue} plastic|{hue} and {hue}"
         " (?:striped|checked|chequered)|golden|gold|silver|steel|chrome|bronze|copper|wooden|stone"
         "|(?:white )?marble)"
     )
-    nouns = f"(?:{every(worlds.NOUNS)}|thing|object|something|polar bear|grizzly bear)"
+    nouns = f"(?:{every(words.NOUNS)}|thing|object|something|polar bear|grizzly bear)"
     place, hour = every(worlds.PLACES), every(worlds.HOURS)
     return re.compile(
-        f"(?:{one(o for o in worlds.OPENINGS if o)} )?an? (?:{one(worlds.FILLERS)} )?(?:{surface} )?"
+        f"(?:{one(o for o in words.OPENINGS if o)} )?an? (?:{one(words.FILLERS)} )?(?:{surface} )?"
         f"(?:(?:statue|sculpture) of an? )?{nouns}(?: {hour})?(?: {place})?(?: {hour})?"
     )
 
@@ -128,7 +116,7 @@ def test_shapes_and_worlds_of_training_and_tests_do_not_meet():
     assert len(set.union(*seeds)) == sum(len(s) for s in seeds)
     for split in SPLITS.values():
         instance = draw_world(split.first, new_shapes=split.new_shapes).instance
-        assert (instance >= worlds.HELD_OUT_SHAPE) == split.new_shapes
+        assert (instance >= HELD_OUT_SHAPE) == split.new_shapes
 
 
 def test_what_a_caption_says_is_true_of_its_picture_and_the_wrong_one_is_not():
@@ -143,7 +131,7 @@ def test_what_a_caption_says_is_true_of_its_picture_and_the_wrong_one_is_not():
         text = sentence(said, rng)
         if said[0] >= 0:
             assert any(
-                noun in text for noun in [*worlds.NOUNS[OBJECTS[said[0]]], "polar", "grizzly"]
+                noun in text for noun in [*words.NOUNS[OBJECTS[said[0]]], "polar", "grizzly"]
             )
         if said[5] >= 0:
             assert any(hour in text for hour in worlds.HOURS[TIMES[said[5]]])
