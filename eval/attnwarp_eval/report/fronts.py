@@ -8,12 +8,7 @@ from collections.abc import Collection, Mapping
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, ratio_text, spread
-from attnwarp_eval.statistics.intervals import (
-    RATIO_INTERVAL,
-    Interval,
-    interval,
-)
-from attnwarp_eval.statistics.intervals import front as pareto
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Interval, interval
 from attnwarp_eval.study.probe import probes
 from attnwarp_eval.study.probe_report import Layout, ProbeReport, report_of
 from attnwarp_eval.study.results import Results, Shared
@@ -67,37 +62,8 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
                 for row in rows
             ]
         section.tables.append(Table(columns, marked, front.title, folded=True))
-        section.tables += _cheapest(results, shared, points, time)
     section.text += [" ".join(ranges)] if ranges else []
     return [section] if section.tables or len(section.text) > len(text) else []
-
-
-def _cheapest(
-    results: Results, shared: Shared, points: Mapping[str, tuple[Interval, Interval]], time: str
-) -> list[Table]:
-    """Cheapest variant for an error: chosen on every other scene, checked on the rest."""
-    scenes = results.study.scene_names
-    chosen_on, checked_on = scenes[::2], scenes[1::2]
-    seconds = {name: each.mean for name, (each, _) in points.items()}
-    chosen, checked = (
-        {name: shared.mean(name, part).mean for name in points} for part in (chosen_on, checked_on)
-    )
-    if not any(map(math.isfinite, checked.values())):
-        return []
-    names = list(points)
-    rows = []
-    for i in pareto([seconds[n] for n in names], [chosen[n] for n in names]):
-        name, limit = names[i], chosen[names[i]]
-        able = [n for n in names if checked[n] <= limit]
-        cheapest = min(able, key=seconds.__getitem__, default="none")
-        taken, elsewhere = 1000 * seconds[name], checked[name]
-        rows.append([number(limit), name, number(taken), number(elsewhere), cheapest])
-    columns = ["error at most", "variant", time, "its error elsewhere", "cheapest elsewhere"]
-    caption = (
-        f"Cheapest for an error: chosen on {', '.join(chosen_on)}, looked up elsewhere on"
-        f" {', '.join(checked_on)}"
-    )
-    return [Table(columns, rows, caption, folded=True)]
 
 
 def _text(reports: Collection[ProbeReport], in_turn: Mapping[str, Timed | None]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import median
@@ -51,11 +51,9 @@ class Shared:
     views: int
     of: int
 
-    def mean(self, variant: str, scenes: Collection[str] | None = None) -> Interval:
-        """Mean over ``scenes``, by default all, of the means over the views."""
-        table = self.tables[variant]
-        chosen = table if scenes is None else [scene for scene in scenes if scene in table]
-        return over_scenes({scene: table[scene] for scene in chosen})
+    def mean(self, variant: str) -> Interval:
+        """Mean over the scenes of the means over the views."""
+        return over_scenes(self.tables[variant])
 
     def text(self, title: str) -> list[str]:
         """Paragraph on the views of the means; none if these are all views."""

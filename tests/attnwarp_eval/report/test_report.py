@@ -758,29 +758,6 @@ def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     assert [picture.caption for picture in section.figures] == ["Cost, one pass"]
 
 
-def test_the_cheapest_for_an_error_is_chosen_on_some_scenes_and_held_against_others(tmp_path):
-    # Chosen on "one" and "three", checked on "two"; good takes 1 s, slipped 2 s.
-    errors = {"good": [[1.0], [0.8], [3.0]], "slipped": [[0.4], [5.0], [0.6]]}
-    seconds = [[1.0] * 3, [2.0] * 3, [1.0] * 3]
-    data = written_runs.record(
-        [],
-        spec={"rounds": 3, "views": ["v0"]},
-        cost={"rounds": {"render": seconds, "pair": seconds}},
-    )
-    cell = written_runs.outcome("timing", "one", ["good", "slipped"], data)
-    front = [{"title": "Cost", "metric": SLIP, "variants": list(errors)}]
-    (section,) = fronts(results(errors, [cell], fronts=front), Layout(tmp_path))
-    assert section.tables[1].rows == [
-        ["2.00", "good", "1000", "0.800", "good"],
-        # The error that it was chosen for is reached elsewhere by none.
-        ["0.500", "slipped", "2000", "5.00", "none"],
-    ]
-    alone = results(errors, [cell], fronts=front, scenes=["one"])
-    alone = dataclasses.replace(alone, cells=[c for c in alone.cells if c.scene == "one"])
-    (section,) = fronts(alone, Layout(tmp_path))
-    assert len(section.tables) == 1
-
-
 def test_a_front_holds_variants_against_each_other_over_the_views_that_all_of_them_have(tmp_path):
     """Oracle: a reading view by view. Over their own views, "fast" would be better than "slow"."""
     values = {
