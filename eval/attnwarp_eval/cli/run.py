@@ -125,31 +125,25 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
 
-    _print_needed(planned, store)
+    _print_needed(store)
 
 
-def _print_needed(planned: Plan, store: Store) -> None:
-    """Print, from finished cells, the scenes that each claim needs, and the cost of the rest."""
+def _print_needed(store: Store) -> None:
+    """Print, from finished cells, the scenes that each claim needs."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
     from attnwarp_eval.report import read_results
-    from attnwarp_eval.report.planning import cost_of, plan_scenes
+    from attnwarp_eval.report.planning import plan_scenes
 
-    results = read_results(store) if (store.root / "study.json").is_file() else None
-    measured = None if results is None else (results, store.root)
-    cost = cost_of([(cell.probe, cell.labels) for cell in planned.todo], measured)
-    if results is not None and (table := plan_scenes(results)).rows:
+    if not (store.root / "study.json").is_file():
+        return
+    if (table := plan_scenes(read_results(store))).rows:
         Console(width=150).print(terminal(table))
         typer.echo(
             "so many scenes tell the difference of interest in 80 % of studies, by one test at 5 %;"
             " more are needed where many claims are adjusted for"
         )
-    if planned.todo and cost.unknown == len(planned.todo):
-        typer.echo("hours: not known before some cells are done")
-        return
-    unknown = f"; {cost.unknown} cells of kinds that none was measured of" if cost.unknown else ""
-    typer.echo(f"to do: {cost.hours:.2g} hours of one worker, {cost.gigabytes:.2g} GB{unknown}")
 
 
 def _name_notices(planned: Plan) -> None:

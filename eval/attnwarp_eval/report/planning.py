@@ -1,13 +1,9 @@
-"""Scenes needed by each claim of a study, estimated from a run, and the cost of the rest."""
+"""Scenes needed by each claim of a study, estimated from a run."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from statistics import fmean
-from typing import Any
+from collections.abc import Iterator
 
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
@@ -20,7 +16,6 @@ from attnwarp_eval.statistics.planning import scenes_needed
 from attnwarp_eval.statistics.scales import Scale
 from attnwarp_eval.statistics.signflips import FEWEST
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 
 INTEREST = {
@@ -77,52 +72,3 @@ def _difference(value: float, scale: Scale) -> str:
     if scale == "odds":
         return f"odds × {number(math.exp(value))}"
     return f"{100 * math.expm1(value):.0f} %" if scale == "ratio" else number(value)
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of the cells to do.
-
-    Attributes:
-        gigabytes: added to the run's folder.
-        unknown: number of cells of unmeasured kinds; ``hours`` and ``gigabytes`` exclude them.
-    """
-
-    hours: float
-    gigabytes: float
-    unknown: int
-
-
-def cost_of(
-    kinds: Iterable[tuple[str, tuple[str, ...]]], measured: tuple[Results, Path] | None
-) -> Cost:
-    """Estimate the cost of cells of some probes and variants from the means of finished ones."""
-    seconds: dict[tuple[str, tuple[str, ...]], list[float]] = {}
-    size = 0.0
-    if measured is not None:
-        results, folder = measured
-        for cell in results.cells:
-            if cell.record is not None:
-                kind = (cell.probe, cell.variants)
-                seconds.setdefault(kind, []).append(seconds_of(cell.record))
-        size = _bytes(folder) / max(1, results.measured)
-    todo = list(kinds)
-    known = [fmean(seconds[kind]) for kind in todo if kind in seconds]
-    return Cost(sum(known) / 3600, size * len(known) / 1e9, len(todo) - len(known))
-
-
-def _bytes(folder: Path) -> int:
-    parts = (folder / name for name in ("cells", "pictures"))
-    return sum(path.stat().st_size for part in parts for path in part.rglob("*") if path.is_file())
-
-
-def seconds_of(record: Record[Any]) -> float:
-    """Seconds of a cell, each counted once: the stages of the first and the other views are within
-    other stages, and parts of an edit within its whole.
-    """
-    inner = ("warm", "steady", "method: ") if "whole" in record.cost.seconds else ("warm", "steady")
-    return sum(
-        seconds or 0.0
-        for stage, seconds in record.cost.seconds.items()
-        if not stage.startswith(inner)
-    )
