@@ -4,7 +4,6 @@ only.
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 from attnwarp_eval.document.write import write_files
@@ -58,9 +57,7 @@ def write_report(
         _check_pictures(results, store)
     report = build(results, folder, timings=timings, pictures=shown)
     path = folder / "results.jsonl"
-    content = "".join(f"{line}\n" for line in lines(results, timings)).encode()
-    write_atomic(path, content)
-    write_atomic(_sum_of(path), _sum_line(path, content))
+    write_atomic(path, "".join(f"{line}\n" for line in lines(results, timings)).encode())
     return [path, *write_files(report, folder, "report", long=long)]
 
 
@@ -95,28 +92,6 @@ def write_report_of_parts(
     results, out = read_parts(folder), out or folder
     report = build(results, out, timings=timings, pictures=False)
     return write_files(report, out, "report", long=long)
-
-
-def wrong_results(store: Store) -> list[str]:
-    """Faults of a run's ``results.jsonl``, at most one line. A missing file is no fault."""
-    path = store.root / "results.jsonl"
-    there = {file.is_file() for file in (path, _sum_of(path))}
-    if there == {False}:
-        return []
-    if there == {True} and _sum_of(path).read_bytes() == _sum_line(path, path.read_bytes()):
-        return []
-    return [
-        f"{path.name}: is not what was written; attnwarp-eval report {store.root} writes it anew"
-    ]
-
-
-def _sum_of(path: Path) -> Path:
-    return path.with_name(f"{path.name}.sha256")
-
-
-def _sum_line(path: Path, content: bytes) -> bytes:
-    """Checksum line in the format of sha256sum, which can check it."""
-    return f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode()
 
 
 def _check_pictures(results: Results, store: Store) -> None:
