@@ -59,7 +59,6 @@ from attnwarp_eval.metrics.multiview import (
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
-from attnwarp_eval.metrics.refit import refit
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
@@ -108,7 +107,6 @@ __all__ = [
     "perceptual_consistency",
     "psnr",
     "reconstruct",
-    "refit",
     "scores",
     "sift_features",
     "sift_matches",

@@ -73,10 +73,6 @@ _FEATURES = Figure("consistency.features", "Features at rendered depth", ("geome
 _PERCEPTUAL = Figure(
     "consistency.perceptual", "Perceptual distance at rendered depth", ("geometry",), "perceptual"
 )
-_HELD = Figure("consistency.held_psnr", "Held-out PSNR, colours refitted", ("ply",))
-_HELD_DISTANCE = Figure(
-    "consistency.held_distance", "Held-out perceptual distance", ("ply",), "perceptual"
-)
 _COLMAP = tuple(
     Figure(f"consistency.colmap_{name}", f"COLMAP {title}", ("colmap",))
     for name, title in (
@@ -87,19 +83,15 @@ _COLMAP = tuple(
         ("failed", "failed"),
     )
 )
-"""Figures of COLMAP."""
-
-_TOGETHER = (_HELD, _HELD_DISTANCE, *_COLMAP)
-"""Figures over all views together."""
+"""Figures of COLMAP, over all views together."""
 
 FIGURES = (
     *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _NEIGHBOURS, _EDIT, _RENDERED, _REPROJECTION,
-    _FEATURES, _PERCEPTUAL, *_TOGETHER,
+    _FEATURES, _PERCEPTUAL, *_COLMAP,
 )  # fmt: skip
 
 _OPTIONS = {
     "poses": "--consistency",
-    "ply": "--ply",
     "geometry": "--ply or --depth",
     "originals": "--originals and --renders",
     "colmap": "--colmap",
@@ -146,15 +138,14 @@ def measure_consistency(
     names = list(edited)
     given = {
         "poses": True,
-        "ply": inputs.ply is not None,
         "geometry": inputs.ply is not None or inputs.depth is not None,
         "originals": bool(originals),
         "colmap": inputs.colmap,
     }
     lacking = {need: option for need, option in _OPTIONS.items() if not given[need]}
     wanted, loaded = usable(FIGURES, lacking, _not_installed, encoders, device, done)
-    together = [figure for figure in wanted if figure in _TOGETHER]
-    wanted = [figure for figure in wanted if figure not in _TOGETHER]
+    together = [figure for figure in wanted if figure in _COLMAP]
+    wanted = [figure for figure in wanted if figure not in _COLMAP]
     pairs = _Pairs(inputs, cameras, posed, edited, originals, wanted, loaded)
     tasks = (_task(pairs, inputs, one, two, device) for one, two in itertools.pairwise(names))
     values: dict[Figure, dict[str, float]] = {figure: {} for figure in wanted}
@@ -176,13 +167,10 @@ def measure_consistency(
             " or one centre of projection: they have no epipolar distance, and those with too few"
             " matches count against TSED, whatever the edit did"
         )
-    for kind, task in ((_COLMAP, _reconstruction), ((_HELD, _HELD_DISTANCE), _refit)):
-        if own := [figure for figure in together if figure in kind]:
-            (found,) = results(store, [task(pairs, names)], 1, report)
-            every = f"all {len(names)}"
-            done.rows += [
-                Row(f.key, f.title, found[f.key], {every: found[f.key]}, f.encoder) for f in own
-            ]
+    if together:
+        (found,) = results(store, [_reconstruction(pairs, names)], 1, report)
+        every = f"all {len(names)}"
+        done.rows += [Row(f.key, f.title, found[f.key], {every: found[f.key]}) for f in together]
     if inputs.scores is not None:
         done.rows += _scores(inputs.scores, list(itertools.pairwise(names)))
     return done
@@ -435,36 +423,6 @@ def _along_flow(one: _View, two: _View) -> float:
         one.edited, two.edited[GRID], flow.xy[GRID], flow.accepted[GRID]
     )
     return result.figures("flow_")[_FLOW.key]
-
-
-def _refit(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
-    """Fit the splats' colours to two thirds of the edited views, and render the others."""
-    assert pairs.inputs.ply is not None
-    network = pairs.loaded.get("perceptual")
-    spec = {
-        "probe": "user refit",
-        "protocol": PROTOCOL,
-        "edited": [_sha256(pairs.edited[name]) for name in names],
-        "posed": [_sha256(pairs.posed[name]) for name in names if name in pairs.posed],
-        "cameras": [pairs.cameras[name].to_dict() for name in names],
-        "ply": _sha256(pairs.inputs.ply),
-        "background": list(pairs.inputs.background),
-        "encoder": None if network is None else network.about.to_dict(),
-    }
-
-    def compute(report: Reporter) -> Json:
-        views = [pairs._small(name) for name in names]
-        held = range(1, len(names), 3)
-        pictures = [view.edited for view in views]
-        (found,) = metrics.refit(pairs.splats, [v.camera for v in views], [pictures], held)
-        figures = {_HELD.key: found.held_out}
-        if network is not None:
-            shown = [found.renders[view] for view in held]
-            distances = network.distance([pictures[view] for view in held], shown)
-            figures[_HELD_DISTANCE.key] = float(np.mean(distances))
-        return {"figures": without_nan(figures)}
-
-    return Task("refit", spec, compute, lambda record: with_nan(record["figures"]))
 
 
 def _reconstruction(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
