@@ -133,7 +133,6 @@ class Probe(ABC, Generic[E]):
         needs_scenes: whether its cells have scenes; else ``cells`` names other subjects.
         judges_variants: whether it has cells for each variant.
         always: whether every run has its cells, even if the study does not list it.
-        main: whether a report's tables default to it.
         times_in_turn: stages of :class:`InTurn` that its records may have.
         edits: whether it measures editing methods, which have separate presets.
     """
@@ -146,7 +145,6 @@ class Probe(ABC, Generic[E]):
     needs_scenes: ClassVar[bool] = True
     judges_variants: ClassVar[bool] = True
     always: ClassVar[bool] = False
-    main: ClassVar[bool] = False
     times_in_turn: ClassVar[Sequence[str]] = ()
     edits: ClassVar[bool] = False
 

@@ -104,19 +104,8 @@ class Variant(Part):
         return WarpSettings.from_dict({**PRESETS[name].to_dict(), **self.set})
 
 
-class UnmeasuredError(ValueError):
-    """A table names a variant that its study does not measure; ``key`` is the table's."""
-
-    def __init__(self, key: str, said: str) -> None:
-        self.key = key
-        super().__init__(f"{key}: {said}")
-
-
 class Ablation(Part):
-    """A table of the report: variants against a baseline, paired on scene and view.
-
-    ``probe`` is empty until the study sets the main probe.
-    """
+    """A table of the report: variants against a baseline, paired on scene and view."""
 
     title: str
     probe: str = ""
@@ -129,7 +118,6 @@ class Front(Part):
     """A figure of the report: a metric (lower is better) against the seconds of the method.
 
     Seconds taken in turn are used if a probe has them for all variants, else seconds of the cells.
-    ``probe`` is empty until the study sets the main probe.
     """
 
     title: str
@@ -143,10 +131,7 @@ FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")
 
 
 class AnswerColumn(Part):
-    """A column of an answer's table: a metric, over targets within a range of yaws, in degrees.
-
-    ``probe`` is empty until the study sets the main probe.
-    """
+    """A column of an answer's table: a metric, over targets within a range of yaws, in degrees."""
 
     metric: str
     probe: str = ""
@@ -158,7 +143,7 @@ class AnswerPictures(Part):
 
     Args:
         caption: text above the pictures.
-        probe: probe that draws the pictures, by default the main probe.
+        probe: probe that draws the pictures.
         scene: scene of the pictures; the first one with pictures if this has none.
         first: label of a leading row -> its content, the same for all variants.
     """
@@ -311,10 +296,10 @@ class Study(Part):
         for name in names:
             if name not in self.variants:
                 near = did_you_mean(name, self.variants)
-                raise UnmeasuredError(key, f"no variant {name!r}{near}")
+                raise ValueError(f"{key}: no variant {name!r}{near}")
             # A variant that is never measured would silently be missing from its table.
             if probe and name not in self.probes.get(probe, []):
-                raise UnmeasuredError(key, f"{name!r} is not measured; add it to probes.{probe}")
+                raise ValueError(f"{key}: {name!r} is not measured; add it to probes.{probe}")
 
     def splats_of(self, variant: Variant) -> Splats:
         """The study's splats, overridden by the variant's fields."""

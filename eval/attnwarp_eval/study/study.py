@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -41,14 +41,6 @@ _Lines = dict[Place, tuple[Path, int]]
 """File and line (from 1) of every key path of a study."""
 
 
-class _PlacedError(ValueError):
-    """A wrong value of a study, with its place."""
-
-    def __init__(self, place: tuple[str, ...], message: str) -> None:
-        self.place = place
-        super().__init__(message)
-
-
 class _Joined(Study):
     """A study whose names are checked against the probes."""
 
@@ -56,34 +48,6 @@ class _Joined(Study):
     @classmethod
     def _scenes_of_a_population(cls, data: Any) -> Any:
         return expanded(data) if isinstance(data, dict) else data
-
-    @model_validator(mode="before")
-    @classmethod
-    def _tables_speak_of_the_main_probe(cls, data: Any) -> Any:
-        main = next((p.name for p in probes() if p.main), "")
-        if not isinstance(data, dict):
-            return data
-        filled = dict(data)
-        for key in ("ablations", "fronts"):
-            if isinstance(data.get(key), list):
-                filled[key] = [
-                    {"probe": main, **entry} if isinstance(entry, dict) else entry
-                    for entry in data[key]
-                ]
-        if isinstance(asked := data.get("answer"), dict):
-            filled["answer"] = dict(asked)
-            for key in ("columns", "figures"):
-                if isinstance(asked.get(key), dict):
-                    filled["answer"][key] = {
-                        title: {"probe": main, **column} if isinstance(column, dict) else column
-                        for title, column in asked[key].items()
-                    }
-            if isinstance(asked.get("pictures"), list):
-                filled["answer"]["pictures"] = [
-                    {"probe": main, **entry} if isinstance(entry, dict) else entry
-                    for entry in asked["pictures"]
-                ]
-        return filled
 
     @model_validator(mode="after")
     def _check_against_the_probes(self) -> _Joined:
@@ -103,41 +67,51 @@ class _Joined(Study):
                 raise ValueError(f"probes.{name}: names no variant, expected at least one")
             self.check_variants(variants, f"probes.{name}")
             check_distinct(variants, f"probes.{name}")
-        tabled = [name for name, p in available.items() if p.tabled]
         for i, ablation in enumerate(self.ablations):
-            _check_probe(ablation.probe, tabled, f"ablations[{i}].probe")
             names = [ablation.baseline, *ablation.variants]
-            self.check_variants(names, f"ablations[{i}]", ablation.probe)
+            self._check_table(ablation.probe, names, f"ablations[{i}]")
             check_distinct(ablation.variants, f"ablations[{i}].variants")
         for i, front in enumerate(self.fronts):
-            _check_probe(front.probe, tabled, f"fronts[{i}].probe")
-            self.check_variants(front.variants, f"fronts[{i}]", front.probe)
+            self._check_table(front.probe, front.variants, f"fronts[{i}]")
             check_distinct(front.variants, f"fronts[{i}].variants")
             key = f"fronts[{i}].metric"
             if _known_metric(front.metric, available[front.probe], key).direction != "lower":
                 raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
         self._check_answer(available)
         self.check_variants(self.pictures.variants, "pictures.variants")
+        measured = set[str]().union(*(p.measured(self) for p in available.values()))
+        for name in self.pictures.variants:
+            if name not in measured:
+                raise ValueError(f"pictures.variants: no probe measures {name!r}; leave it out")
         for p in available.values():
             p.check(self)
         return self
+
+    def _check_table(self, name: str, variants: Sequence[str], key: str) -> None:
+        """Raise ValueError unless the probe of a table is written and measures its variants."""
+        tabled = [p.name for p in probes() if p.tabled]
+        if not name:
+            measuring = [own for own in self.probes if own in tabled]
+            lines = " or ".join(f"'probe: {own}'" for own in measuring or tabled)
+            raise ValueError(f"{key}.probe: is missing; write {lines}")
+        if name not in tabled:
+            near = did_you_mean(name, tabled)
+            raise ValueError(f"{key}.probe: no table can be made of {name!r}{near}")
+        self.check_variants(variants, key, name)
 
     def _check_answer(self, available: dict[str, Probe[Any]]) -> None:
         if self.answer is None:
             return
         asked = self.answer
-        tabled = [name for name, p in available.items() if p.tabled]
         for key, columns in (("columns", asked.columns), ("figures", asked.figures)):
             for title, column in columns.items():
-                _check_probe(column.probe, tabled, f"answer.{key}.{title}.probe")
+                rows = list(asked.variants) if key == "columns" else []
+                self._check_table(column.probe, rows, f"answer.{key}.{title}")
                 _known_metric(
                     column.metric, available[column.probe], f"answer.{key}.{title}.metric"
                 )
-        for column in asked.columns.values():
-            self.check_variants(asked.variants, "answer.variants", column.probe)
         for i, entry in enumerate(asked.pictures):
-            _check_probe(entry.probe, tabled, f"answer.pictures[{i}].probe")
-            self.check_variants(entry.variants, f"answer.pictures[{i}].variants", entry.probe)
+            self._check_table(entry.probe, entry.variants, f"answer.pictures[{i}]")
         if self.answer.decides not in self.answer.columns:
             near = did_you_mean(self.answer.decides, self.answer.columns)
             raise ValueError(f"answer.decides: no column {self.answer.decides!r}{near}")
@@ -160,17 +134,10 @@ class _Joined(Study):
                 for p in probes():
                     p.check_variant(self, variant)
             except ValidationError as error:
-                raise _PlacedError(
-                    ("variants", name, "splats"),
-                    f"variants.{name}.splats: {explain_errors(error, Splats)}",
-                ) from None
+                why = explain_errors(error, Splats)
+                raise ValueError(f"variants.{name}.splats: {why}") from None
             except ValueError as error:
-                raise _PlacedError(("variants", name), f"variants.{name}: {error}") from None
-
-
-def _check_probe(name: str, available: list[str], key: str) -> None:
-    if name not in available:
-        raise ValueError(f"{key}: no table can be made of {name!r}{did_you_mean(name, available)}")
+                raise ValueError(f"variants.{name}: {error}") from None
 
 
 def _known_metric(metric: str, own: Probe[Any], key: str) -> Metric:
@@ -319,52 +286,31 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             for name in data["scenes"]
         ]
     try:
-        study, data = _parsed(data, lambda key: line_of(lines, (key,))[0] != path)
+        study = parse_study(data)
     except ValidationError as error:
-        place = _place(error.errors()[0])
-        file, line = line_of(lines, place) if place else (path, None)
+        told = explain_errors(error)
+        place = _place(told, lines)
+        file, line = lines[place] if place else (path, None)
         at = f"{file}:{line}" if line else str(file)
-        lacks = ""
-        if ("extends",) in lines and file == path and error.errors()[0].get("input", 0) is None:
-            lacks = "; null takes a key of the extended study away, which has none of this name"
-        raise StudyError(f"{at}: {explain_errors(error)}{lacks}") from None
+        if file != path:
+            told += f"; {path.name} may have {place[0]} of its own, or '{place[0]}: null'"
+        elif ("extends",) in lines and error.errors()[0].get("input", 0) is None:
+            told += "; null takes a key of the extended study away, which has none of this name"
+        raise StudyError(f"{at}: {told}") from None
     measured = set[str]().union(*(p.measured(study) for p in probes()))
-    if idle := study.variants.keys() - measured:
-        for name in (name for name in study.variants if name in idle):
-            file, line = line_of(lines, ("variants", name))
-            if file == path:
-                raise StudyError(
-                    f"{file}:{line}: variants.{name}: no probe measures it; name it under probes,"
-                    " or leave it out"
-                )
-        # Tables of an extended study, of which this study measures fewer variants.
-        kept = {name: value for name, value in data["variants"].items() if name not in idle}
-        shown = data.get("pictures", {})
-        rows = [name for name in shown.get("variants", ()) if name not in idle]
-        study = parse_study({**data, "variants": kept, "pictures": {**shown, "variants": rows}})
+    for name in study.variants:
+        file, line = line_of(lines, ("variants", name))
+        if name not in measured and file == path:
+            raise StudyError(
+                f"{file}:{line}: variants.{name}: no probe measures it; name it under probes, or"
+                " leave it out"
+            )
+    kept = {name: own for name, own in study.variants.items() if name in measured}
+    study = study.model_copy(update={"variants": kept})
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}
         study._left_out = tuple(name for name in every if scene_name(name) not in called)
     return study
-
-
-def _parsed(data: dict[str, Any], inherited: Callable[[str], bool]) -> tuple[Study, dict[str, Any]]:
-    """Parse a study; also return its data without inherited tables of unmeasured variants.
-
-    Args:
-        inherited: predicate of keys that come from an extended study.
-    """
-    try:
-        return parse_study(data), data
-    except ValidationError as error:
-        unmeasured = getattr(error.errors()[0].get("ctx", {}).get("error"), "key", "")
-        table = re.match(r"(ablations|fronts|answer|yaw)(?:\[(\d+)\])?", unmeasured)
-        if not table or not inherited(table[1]):
-            raise
-    left = {key: value for key, value in data.items() if key != table[1]}
-    if table[2] is not None:
-        left[table[1]] = [e for i, e in enumerate(data[table[1]]) if i != int(table[2])]
-    return _parsed(left, inherited)
 
 
 def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Lines]:
@@ -443,10 +389,11 @@ def _extended(
     return data, kept | own_lines
 
 
-def _place(problem: Any) -> tuple[int | str, ...]:
-    """Key path of a problem in the file; empty for a problem without a single place."""
-    own = problem.get("ctx", {}).get("error")
-    return own.place if isinstance(own, _PlacedError) else problem["loc"]
+def _place(told: str, lines: _Lines) -> Place:
+    """The deepest key path of a study's files with which an error begins; empty without one."""
+    paths = {"".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in p)[1:]: p for p in lines}
+    named = [text for text in paths if re.match(rf"{re.escape(text)}[.:[]", told)]
+    return paths[max(named, key=len)] if named else ()
 
 
 def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -27,8 +27,8 @@ STUDY = {
         "sentences": ["Without it {hidden|open} is hidden, with it {hidden|masked}."],
         "variants": {"masked": "keeps what is seen", "open": "keeps all"},
         "columns": {
-            "hidden": {"metric": HIDDEN, "yaw": [60, 180]},
-            "feature error": {"metric": ERROR},
+            "hidden": {"probe": "warp", "metric": HIDDEN, "yaw": [60, 180]},
+            "feature error": {"probe": "warp", "metric": ERROR},
         },
         "decides": "feature error",
     },
@@ -93,7 +93,7 @@ def test_six_scenes_and_more_show_no_range():
 
 
 def test_a_figure_that_no_record_has_is_undefined_and_recommends_nobody():
-    columns = {"lands": {"metric": "warp.epe_median"}}
+    columns = {"lands": {"probe": "warp", "metric": "warp.epe_median"}}
     asked = {**STUDY["answer"], "sentences": [], "columns": columns, "decides": "lands"}
     section = answer(run(asked=asked))
     assert section.tables[0].rows[0][1] == "undefined"
@@ -103,7 +103,7 @@ def test_a_figure_that_no_record_has_is_undefined_and_recommends_nobody():
 def test_a_sentence_with_a_figure_that_was_not_measured_is_left_out():
     asked = {
         **STUDY["answer"],
-        "figures": {"near": {"metric": HIDDEN, "yaw": [0, 60]}},
+        "figures": {"near": {"probe": "warp", "metric": HIDDEN, "yaw": [0, 60]}},
         "sentences": ["Near: {near|open}.", "Near: {near|masked}."],
     }
     made = run(asked=asked)
@@ -118,6 +118,7 @@ def test_pictures_stand_in_a_row_for_each_variant_and_a_column_for_each_view():
         "pictures": [
             {
                 "caption": "C",
+                "probe": "warp",
                 "scene": "two",
                 "first": {"true": "target"},
                 "content": "warped",
@@ -171,7 +172,10 @@ def test_seconds_are_left_out_of_a_report_without_timings():
         ({"sentences": ["{hiden|open} of it"]}, "did you mean 'hidden'"),
         ({"sentences": ["{hidden|opn} of it"]}, "did you mean 'open'"),
         ({"decides": "hiden"}, "answer.decides: no column 'hiden'"),
-        ({"columns": {"hidden": {"metric": "occlusion.hiden"}}}, "no metric 'occlusion.hiden'"),
+        (
+            {"columns": {"hidden": {"probe": "warp", "metric": "occlusion.hiden"}}},
+            "no metric 'occlusion.hiden'",
+        ),
         ({"variants": {"masked": "a", "shut": "b"}}, "no variant 'shut'"),
     ],
 )

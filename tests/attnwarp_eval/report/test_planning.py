@@ -20,7 +20,7 @@ spp: 1
 splats: {kind: 2d, count: 500}
 variants: {corrected: {preset: corrected}, slipped: {set: {pixel_centers: integer}}}
 probes: {warp: [corrected, slipped]}
-ablations: [{title: Slip, baseline: corrected, variants: [slipped]}]
+ablations: [{title: Slip, probe: warp, baseline: corrected, variants: [slipped]}]
 """
 
 

@@ -50,7 +50,9 @@ def study(**changes):
         "scenes": list(SCENES),
         "variants": {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
         "probes": {"warp": ["good", "slipped"]},
-        "ablations": [{"title": "Slip", "baseline": "good", "variants": ["slipped"]}],
+        "ablations": [
+            {"title": "Slip", "probe": "warp", "baseline": "good", "variants": ["slipped"]}
+        ],
         **changes,
     }
 
@@ -625,7 +627,10 @@ def test_groups_that_would_not_fit_on_a_page_are_folded_and_named():
         CLEAR,
         variants={**study()["variants"], **{name: {} for name in many}},
         probes={"warp": ["good", "slipped", *many]},
-        ablations=[{"title": t, "baseline": "good", "variants": v} for t, v in groups.items()],
+        ablations=[
+            {"title": t, "probe": "warp", "baseline": "good", "variants": v}
+            for t, v in groups.items()
+        ],
     )
     (section,) = differences(run, compared_of(run, []))
     assert [table.folded for table in section.tables] == [False, True, True]
@@ -724,7 +729,7 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
 
 def test_a_front_of_a_figure_that_no_view_has_says_so(tmp_path):
     title = {"title": "Cost", "variants": ["good", "slipped"]}
-    front = [{**title, "metric": "warp.feature_all_accepted"}]  # without its grid
+    front = [{**title, "probe": "warp", "metric": "warp.feature_all_accepted"}]  # without its grid
     (section,) = fronts(results(CLEAR, fronts=front), Layout(tmp_path))
     assert section.text[-1] == "Cost: no view has a value of `warp.feature_all_accepted`."
     assert not section.tables and not section.figures
@@ -738,7 +743,7 @@ def test_rounding_is_no_difference():
 
 
 def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
-    front = [{"title": "Cost", "metric": SLIP, "variants": ["good", "slipped"]}]
+    front = [{"title": "Cost", "probe": "warp", "metric": SLIP, "variants": ["good", "slipped"]}]
     rounds = {"render": [[1.0] * 3] * 2, "pair": [[1.0, 2.0, 4.0], [1.0, 2.0, 4.0]]}
     data = written_runs.record([], spec={"rounds": 3, "views": ["v0"]}, cost={"rounds": rounds})
     timed = results(CLEAR, [written_runs.outcome("timing", "one", ["good"], data)], fronts=front)
@@ -767,7 +772,7 @@ def test_a_front_holds_variants_against_each_other_over_the_views_that_all_of_th
         "rare": [[0.1, None, None], [None, 0.1, 0.1], [None, None, None]],
     }
     names = list(values)
-    front = [{"title": "Cost", "metric": SLIP, "variants": names}]
+    front = [{"title": "Cost", "probe": "warp", "metric": SLIP, "variants": names}]
     run = results(
         values, variants={n: {} for n in names}, probes={"warp": names}, ablations=[], fronts=front
     )

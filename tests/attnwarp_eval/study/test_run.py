@@ -55,11 +55,21 @@ SMALL = {
     },
     "timing_rounds": 3,
     "ablations": [
-        {"title": "Presets", "baseline": "corrected", "variants": ["bounds only", "released"]}
+        {
+            "title": "Presets",
+            "probe": "warp",
+            "baseline": "corrected",
+            "variants": ["bounds only", "released"],
+        }
     ],
     "yaw": {"variants": ["corrected", "bounds only"]},
     "fronts": [
-        {"title": "Cost", "metric": "warp.epe_median.16", "variants": ["corrected", "released"]}
+        {
+            "title": "Cost",
+            "probe": "warp",
+            "metric": "warp.epe_median.16",
+            "variants": ["corrected", "released"],
+        }
     ],
     "pictures": {"variants": ["corrected"], "views": ["yaw030"]},
 }

@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import re
 
 import pytest
 import trimesh
@@ -97,11 +98,24 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
             "add it to probes.fit",
         ),
         (
-            {"fronts": [{"title": "t", "metric": "warp.epe_medain.64", "variants": ["again"]}]},
+            {
+                "fronts": [
+                    {
+                        "title": "t",
+                        "probe": "warp",
+                        "metric": "warp.epe_medain.64",
+                        "variants": ["again"],
+                    }
+                ]
+            },
             "no metric 'warp.epe_medain.64'; did you mean 'warp.epe_median'",
         ),
         (
-            {"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]},
+            {
+                "fronts": [
+                    {"title": "t", "probe": "warp", "metric": "occlusion.f1", "variants": ["again"]}
+                ]
+            },
             "less is better",
         ),
         (
@@ -115,7 +129,16 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ({"probes": {"warp": []}}, "probes.warp: names no variant, expected at least one"),
         ({"splats": {"position_noise": float("inf")}}, "position_noise: got inf, but .*finite"),
         (
-            {"fronts": [{"title": "t", "metric": "warp.epe_median.{size}", "variants": ["again"]}]},
+            {
+                "fronts": [
+                    {
+                        "title": "t",
+                        "probe": "warp",
+                        "metric": "warp.epe_median.{size}",
+                        "variants": ["again"],
+                    }
+                ]
+            },
             "braces may hold 'layer' alone",
         ),
     ],
@@ -477,23 +500,48 @@ def test_a_study_of_fewer_probes_leaves_out_the_variants_that_it_does_not_measur
         load_study(extending(tmp_path, f"{child}variants: {{own: {{}}}}\n"))
 
 
-def test_a_study_of_fewer_probes_leaves_out_the_tables_of_what_it_does_not_measure(tmp_path):
-    """Oracle: the tables of the base that name the probe that is left."""
-    ablation = "{title: %s, probe: %s, baseline: corrected, variants: [%s]}"
-    tables = (
-        f"ablations:\n  - {ablation % ('gone', 'warp', 'bare')}\n"
-        f"  - {ablation % ('left', 'depth', 'slipped')}\n"
-        "fronts:\n  - {title: gone, probe: warp, metric: 'warp.feature_visible.{layer}', variants: [bare]}\n"
-        "answer:\n  question: q\n  decides: c\n  variants: {slipped: a, bare: b}\n"
-        "  columns: {c: {metric: occlusion.recall, probe: warp}}\n"
-        "pictures: {variants: [corrected, bare]}\n"
-    )
-    base = BASE.replace("depth: [corrected]", "depth: [corrected, slipped]") + tables
+@pytest.mark.parametrize(
+    ("key", "table"),
+    [
+        ("ablations[0]", "[{title: t, probe: warp, baseline: corrected, variants: [bare]}]"),
+        ("fronts[0]", "[{title: t, probe: warp, metric: 'warp.epe_median.64', variants: [bare]}]"),
+        ("answer", "{question: q, decides: c, variants: {slipped: a, bare: b},"
+         " columns: {c: {metric: occlusion.recall, probe: warp}}}"),
+        ("yaw.variants", "{variants: [bare]}"),
+        ("pictures.variants", "{variants: [corrected, bare]}"),
+    ],
+)  # fmt: skip
+def test_a_table_of_the_extended_study_that_this_one_does_not_measure_is_refused(
+    tmp_path, key, table
+):
+    name = re.match("[a-z]+", key)[0]
+    base = BASE.replace("yaw: {variants: [slipped]}\n", "") + f"{name}: {table}\n"
     child = "extends: base.yaml\nname: a\nprobes: {warp: null}\n"
-    study = load_study(extending(tmp_path, child, base))
-    assert [table.title for table in study.ablations] == ["left"]
-    assert (study.fronts, study.answer, study.yaw.variants) == ([], None, [])
-    assert study.pictures.variants == ["corrected"]
-    own = f"ablations: [{ablation % ('own', 'warp', 'slipped')}]\n"
-    with pytest.raises(StudyError, match=r"child.yaml:.*ablations\[0\]: .* is not measured"):
-        load_study(extending(tmp_path, child + own, base))
+    remedy = f"child.yaml may have {name} of its own, or '{name}: null'"
+    with pytest.raises(StudyError, match=rf"base.yaml:14: {re.escape(key)}.*; {remedy}"):
+        load_study(extending(tmp_path, child, base))
+    without = load_study(extending(tmp_path, f"{child}{name}: null\n", base))
+    assert list(without.variants) == ["corrected"]
+
+
+@pytest.mark.parametrize(
+    ("table", "place"),
+    [
+        ("ablations: [{title: t, baseline: a, variants: [b]}]", "ablations[0]"),
+        ("fronts: [{title: t, metric: warp.epe_median, variants: [b]}]", "fronts[0]"),
+        ("answer: {question: q, variants: {a: A, b: B}, decides: c, columns: {c: {metric: m}}}",
+         "answer.columns.c"),
+        ("answer: {question: q, variants: {a: A, b: B}, decides: c, columns: {c: {metric:"
+         " occlusion.recall, probe: warp}}, pictures: [{caption: x, content: y, variants: [b]}]}",
+         "answer.pictures[0]"),
+    ],
+)  # fmt: skip
+def test_a_table_that_names_no_probe_is_told_which_line_to_write(tmp_path, table, place):
+    path = tmp_path / "study.yaml"
+    path.write_text(
+        "name: s\nscenes: [spheres]\nvariants: {a: {}, b: {preset: released}}\n"
+        f"probes: {{timing: [a, b], warp: [a, b], depth: [a]}}\n{table}\n"
+    )
+    told = f"study.yaml:5: {place}.probe: is missing; write 'probe: warp' or 'probe: depth'"
+    with pytest.raises(StudyError, match=re.escape(told)):
+        load_study(str(path))

@@ -32,7 +32,6 @@ class Warp(WarpProbe):
     name = "warp"
     study_part = StudyPart
     metrics = metrics_of("warp.", "occlusion.")
-    main = True
 
     def check(self, study: Study) -> None:
         """Require that the variants of masks by yaw are measured."""
