@@ -29,6 +29,7 @@ from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
 from attnwarp.render import Render, render
+from attnwarp.render.api import WORK
 from attnwarp.reporting import SILENT, Pace, Reporter
 from attnwarp.workdir import CheckpointClock, Workdir, results_in
 
@@ -98,6 +99,7 @@ class Fit:
         kept: evaluation of the returned splats.
         exposures: (3, 4) change of colour of each fitted view, for
             :class:`attnwarp.fit.Views`; empty unless the settings estimate exposure.
+        pairs: splat-pixel pairs that the iterations rendered, in all processes.
 
     Example:
         >>> import numpy as np
@@ -120,6 +122,7 @@ class Fit:
     extent: float
     kept: Record
     exposures: list[npt.NDArray[np.float32]] = field(default_factory=list)
+    pairs: int = 0
 
 
 @on_cpu_unless_named
@@ -262,7 +265,7 @@ class _Run:
         self.best: dict[str, Tensor] = {}
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
-        self.iteration = 0
+        self.iteration = self.pairs = 0
         self.seconds = self.cpu_seconds = 0.0
         self.loss = self.error = math.nan
         self.history: list[Record] = []
@@ -319,6 +322,7 @@ class _Run:
             self.random.set_state(state["random"])
             self.queue = list(state["queue"])
             self.iteration = int(state["iteration"])
+            self.pairs = int(state.get("pairs", 0))  # earlier checkpoints have none
             self.seconds, self.cpu_seconds = float(state["seconds"]), float(state["cpu_seconds"])
             self.loss, self.error = float(state["loss"]), float(state["error"])
             self.history = [Record(**record) for record in state["history"]]
@@ -356,6 +360,7 @@ class _Run:
                 "random": self.random.get_state(),
                 "queue": list(self.queue),
                 "iteration": self.iteration,
+                "pairs": self.pairs,
                 "seconds": self.seconds,
                 "cpu_seconds": self.cpu_seconds,
                 "loss": self.loss,
@@ -382,8 +387,9 @@ class _Run:
             stopped = self._reason_to_stop(max_seconds, stop)
             if stopped:
                 break
-            wall, cpu = time.perf_counter(), time.process_time()
+            wall, cpu, pairs = time.perf_counter(), time.process_time(), WORK["pairs"]
             self.iterate()
+            self.pairs += WORK["pairs"] - pairs
             self.seconds += time.perf_counter() - wall
             self.cpu_seconds += time.process_time() - cpu
             # Evaluate before the final report, so that the last displayed figures are the result's.
@@ -413,6 +419,7 @@ class _Run:
             self.extent,
             max(self.history, key=_chosen) if self.chooses else self.history[-1],
             [] if changes is None else list(changes.cpu().numpy()),
+            self.pairs,
         )
 
     def _snapshot(self) -> dict[str, Tensor]:

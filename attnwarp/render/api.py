@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,6 +23,9 @@ Tensor = torch.Tensor
 
 BACKENDS = ("auto", "cpu", "reference", "gpu")
 DEPTHS = {"2d": ("intersection", "center"), "3d": ("center", "peak")}
+
+WORK: Counter[str] = Counter()
+"""Work of this process so far: splat-pixel ``pairs`` of all renders."""
 
 
 @dataclass(eq=False)
@@ -247,6 +251,7 @@ def render(
         from attnwarp.render import gpu
 
         outputs = gpu.render(inputs)
+    WORK["pairs"] += outputs.counters.get("pairs", 0)
     return _result(outputs, inputs, camera, pose, chosen)
 
 

@@ -94,7 +94,15 @@ object, their neighbours, pixels visible in the source; for a lifted mask also t
 
 
 COUNTERS: Mapping[str, Margin] = dict.fromkeys(
-    ("visible", "tile_pairs", "pairs", "source_pairs", "composited", "contributing"),
+    (
+        "visible",
+        "tile_pairs",
+        "pairs",
+        "source_pairs",
+        "rendered_pairs",
+        "composited",
+        "contributing",
+    ),
     Margin(0.0, 1e-3),
 )
 """Margins of the counters that depend on comparisons of rounded numbers, such as whether a

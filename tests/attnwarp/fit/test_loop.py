@@ -14,11 +14,12 @@ from rounding import prepared
 
 from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputError, InputWarning
-from attnwarp.fit import FitSettings, Views, fit, from_points
+from attnwarp.fit import FitSettings, Views, fit, from_points, loop
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.fit.model import Model
 from attnwarp.io import read_ply
 from attnwarp.render import reference, render
+from attnwarp.trial import disc, view
 from attnwarp.workdir import Workdir
 
 from .conftest import blobs, pictures, ring
@@ -441,6 +442,24 @@ def test_an_argument_of_another_type_is_named(scene, position, value, message):
 
 
 @pytest.mark.door
+def test_the_pairs_of_a_fit_are_those_of_its_iterations_in_all_sittings(tmp_path, monkeypatch):
+    """Oracle: three faint splats, far larger than the picture, meet each of its pixels."""
+    one = dataclasses.replace(disc(50.0), opacities=torch.tensor([0.02]))
+    start = one.select(torch.zeros(3, dtype=torch.int64))
+    grey, held = (Views([view(x, side=16)], [np.full((16, 16, 3), 0.5)]) for x in (0, 1))
+    settings = FitSettings(kind="2d", iterations=6, sh_degree=0, densify=False)
+    asked = itertools.count()
+    first = fit(
+        start, grey, settings, held_out=held, folder=tmp_path, stop=lambda: next(asked) == 4
+    )
+    assert (first.iteration, first.pairs) == (4, 4 * 3 * 16 * 16)
+    whole = fit(start, grey, settings, held_out=held, folder=tmp_path)
+    assert (whole.iteration, whole.pairs) == (6, 6 * 3 * 16 * 16)
+    # An iteration that renders twice is twice the work.
+    monkeypatch.setattr(loop, "render", lambda *a, **k: (render(*a, **k), render(*a, **k))[0])
+    assert fit(start, grey, settings).pairs == 2 * whole.pairs
+
+
 def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tmp_path):
     start, settings = begin(scene, iterations=2, sh_degree=0)
     refusals = []

@@ -9,7 +9,10 @@ import pathlib
 import pytest
 from typer.testing import CliRunner
 
+from attnwarp.fit import loop as fit_loop
+from attnwarp.methods import tuning
 from attnwarp.methods.algorithms.attention_warping import AttentionWarping
+from attnwarp.render import render
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import compare, read_baseline, read_snapshot
 from attnwarp_eval.compare.pictures import pictures_of_baseline
@@ -113,6 +116,11 @@ def a_repeated_edit(patch):
     patch.setattr(AttentionWarping, "edit_targets", twice)
 
 
+def each_step_rendered_twice(patch):
+    for module in (tuning, fit_loop):
+        patch.setattr(module, "render", lambda *a, **k: (render(*a, **k), render(*a, **k))[0])
+
+
 def a_dropped_cell(patch):
     def fails(self, work):
         if work.cell.variant == "released":
@@ -130,6 +138,7 @@ FOUND = {
     a_dropped_metric: ("missing", "spheres / warp / corrected / seed 0 / warp.epe_median"),
     a_doubled_counter: ("counter", "spheres / warp / corrected / seed 0 / taps"),
     a_repeated_edit: ("counter", "spheres / ideal / corrected / seed 0 / network_rows"),
+    each_step_rendered_twice: ("counter", "spheres / ideal / corrected / seed 0 / rendered_pairs"),
     a_dropped_cell: ("missing", "spheres / warp / released / seed 0"),
 }
 
@@ -152,6 +161,8 @@ def test_a_regression_in_the_code_is_found(trusted, planted, tmp_path):
         for row in result["rows"]
     }
     assert FOUND[planted] in named
+    if planted is each_step_rendered_twice:
+        assert ("counter", "spheres / fit / 2DGS fit / seed 0 / rendered_pairs") in named
     # What moved is shown before and after.
     moved = planted in (half_a_pixel, one_percent_in_depth, a_mask_rule_lost)
     assert ('class="slider"' in html.read_text()) == moved

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import Gaussians
+from attnwarp.render.api import WORK as RENDERED
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp.warp.view import WORK
 from attnwarp_eval.cost import Meter
@@ -111,7 +112,7 @@ def run_method(
 @contextmanager
 def _work_counted(meter: Meter, editor: Editor) -> Iterator[None]:
     """Count what a method does: rows that pass through the editor's network, pairs of views warped,
-    and splat-pixel pairs of the surfaces rendered for them.
+    and splat-pixel pairs of the surfaces rendered for them and of all renders, tuning's included.
 
     The method's own figure of rows is its plan, which a fault in a pass does not change.
     """
@@ -122,13 +123,14 @@ def _work_counted(meter: Meter, editor: Editor) -> Iterator[None]:
         latents = next(a for a in (*arguments, *named.values()) if isinstance(a, torch.Tensor))
         rows += len(latents)
 
-    before = WORK.copy()
+    before, pairs = WORK.copy(), RENDERED["pairs"]
     hook = editor.network.register_forward_pre_hook(note, with_kwargs=True)
     try:
         yield
     finally:
         hook.remove()
-    meter.count(**{ROWS: rows}, **{k: WORK[k] - before[k] for k in ("view_pairs", "pairs")})
+    warped = {k: WORK[k] - before[k] for k in ("view_pairs", "pairs")}
+    meter.count(**{ROWS: rows}, **warped, rendered_pairs=RENDERED["pairs"] - pairs)
 
 
 def other_world(work: Work) -> World | None:

@@ -114,7 +114,11 @@ class Fit(Probe[Curve]):
             world.add(camera)
         # The fit's seconds go into the curve, which also holds those of earlier runs.
         result = fits.fit_of(work)
-        meter.count(iterations=result.iteration, splats=len(result.gaussians))
+        meter.count(
+            iterations=result.iteration,
+            rendered_pairs=result.pairs,
+            splats=len(result.gaussians),
+        )
         settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
         for name, camera in cameras.items():
             with meter.view():
