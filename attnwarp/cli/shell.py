@@ -186,10 +186,10 @@ class Program(TyperGroup):
         for name, commands in COMMANDS.items():
             if args[0] in commands and args[0] not in self.commands:
                 raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
-        name, command, rest = super().resolve_command(ctx, args)
-        if command:
-            _show_no_type_of_flags(command.get_params(ctx))
-        return name, command, rest
+        resolved = super().resolve_command(ctx, args)
+        if resolved[1]:
+            _show_no_type_of_flags(resolved[1].get_params(ctx))
+        return resolved
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options of the program itself."""
