@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp import sfm
 from attnwarp.camera import Camera
+from attnwarp_eval import sfm
 from attnwarp_eval.metrics._pictures import picture
 from attnwarp_eval.metrics.arrays import share
 

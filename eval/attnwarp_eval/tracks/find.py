@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp import sfm
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset
 from attnwarp.io.colmap import find_model
 from attnwarp.io.images import read_image
 from attnwarp.reporting import SILENT, Reporter
+from attnwarp_eval import sfm
 from attnwarp_eval.files import write_atomic
 
 Array = npt.NDArray[np.float64]
