@@ -23,16 +23,6 @@ from attnwarp_eval.metrics.embedding import (
     image_similarity,
     match_similarity,
 )
-from attnwarp_eval.metrics.epipolar import (
-    Keypoints,
-    Tsed,
-    epipolar_distance,
-    match_features,
-    sift_features,
-    sift_matches,
-    tsed,
-    tsed_of_views,
-)
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
 from attnwarp_eval.metrics.image import (
     EditPsnr,
@@ -68,10 +58,8 @@ __all__ = [
     "Disagreement",
     "EditPsnr",
     "Flow",
-    "Keypoints",
     "Reconstruction",
     "Similarity",
-    "Tsed",
     "YawBin",
     "above_floor",
     "answers_by_view",
@@ -88,7 +76,6 @@ __all__ = [
     "edit_fidelity",
     "edit_psnr",
     "endpoint_error",
-    "epipolar_distance",
     "feature_consistency",
     "feature_error",
     "fidelity",
@@ -96,7 +83,6 @@ __all__ = [
     "image_similarity",
     "mask_error",
     "mask_overlap",
-    "match_features",
     "match_similarity",
     "metric",
     "ms_ssim",
@@ -108,10 +94,6 @@ __all__ = [
     "psnr",
     "reconstruct",
     "scores",
-    "sift_features",
-    "sift_matches",
     "ssim",
     "ssim_map",
-    "tsed",
-    "tsed_of_views",
 ]

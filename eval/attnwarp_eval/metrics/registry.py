@@ -177,13 +177,6 @@ _SPECS = (
         )
         for name, unit, direction, atol, rtol, what in _DISAGREEMENT
     ),
-    Metric("consistency.tsed_1px", "share", "higher", 1e-4, 0, "view pairs with 10 SIFT matches, the median within 1 px of epipolar lines"),
-    Metric("consistency.tsed_2px", "share", "higher", 1e-4, 0, "the same within 2 px"),
-    Metric("consistency.tsed_4px", "share", "higher", 1e-4, 0, "the same within 4 px"),
-    Metric("consistency.tsed_distance", "px", "lower", 1e-2, 1e-2, "median over view pairs of their median epipolar distance"),
-    Metric("consistency.tsed_pairs", "views", "none", 0, 0, "view pairs that were judged"),
-    Metric("consistency.tsed_few_matches", "views", "none", 0, 0, "of them, pairs with fewer than 10 matches, which count against"),
-    Metric("consistency.tsed_no_baseline", "views", "none", 0, 0, "of them, pairs with one centre of projection, left out"),
     Metric("consistency.colmap_registered", "share", "higher", 1e-4, 0, "views that COLMAP's largest model has"),
     Metric("consistency.colmap_points", "points", "higher", 0, 5e-2, "its 3D points"),
     Metric("consistency.colmap_track_length", "views", "higher", 1e-2, 5e-2, "views that see a point, mean"),

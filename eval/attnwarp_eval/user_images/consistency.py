@@ -1,9 +1,9 @@
 """Agreement of neighbouring views of a user's edit, from posed pictures without truth.
 
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
-compares each view with the next in the order of their names. COLMAP reconstructs all of them.
-Keypoints are found at full size; all else is computed on pictures whose longest side is
-:data:`LONGEST` px, and colours at every second row and column of them.
+compares each view with the next in the order of their names. COLMAP reconstructs all of them at
+full size; all else is computed on pictures whose longest side is :data:`LONGEST` px, and colours at
+every second row and column of them.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
-from attnwarp.camera import Camera, fundamental
+from attnwarp.camera import Camera
 from attnwarp.encoders import Kind
 from attnwarp.errors import InputError
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.metrics.epipolar import LEAST_MATCHES, LIMITS
 from attnwarp_eval.metrics.known_geometry import GRID
 from attnwarp_eval.metrics.score_table import read_scores
 from attnwarp_eval.study.record import Json, with_nan
@@ -46,15 +45,11 @@ from attnwarp_eval.user_images.measure import (
 )
 
 LONGEST = 256
-"""Longest side in px of pictures, except for keypoints; smaller ones keep their size."""
+"""Longest side in px of pictures, except for COLMAP; smaller ones keep their size."""
 
 PROTOCOL = 3
 """Version; raised when the same pictures would give other figures."""
 
-_TSED = tuple(
-    Figure(f"consistency.tsed_{limit}px", f"TSED at {limit} px", ("poses",)) for limit in LIMITS
-)
-_DISTANCE = Figure("consistency.tsed_distance", "Epipolar distance", ("poses",))
 _FLOW = Figure("consistency.flow_delta_e", "Flow warp error", ("originals",))
 _DIRECTION = Figure(
     "embedding.direction_consistency", "CLIP direction consistency", ("originals",), "clip"
@@ -86,7 +81,7 @@ _COLMAP = tuple(
 """Figures of COLMAP, over all views together."""
 
 FIGURES = (
-    *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _NEIGHBOURS, _EDIT, _RENDERED, _REPROJECTION,
+    _FLOW, _DIRECTION, _MATCHES, _NEIGHBOURS, _EDIT, _RENDERED, _REPROJECTION,
     _FEATURES, _PERCEPTUAL, *_COLMAP,
 )  # fmt: skip
 
@@ -98,7 +93,7 @@ _OPTIONS = {
 }
 
 _FOUND_BY: Mapping[Figure, tuple[str, str]] = {
-    **dict.fromkeys((*_TSED, _DISTANCE, _FLOW), ("cv2", "eval")),
+    _FLOW: ("cv2", "eval"),
     **dict.fromkeys(_COLMAP, ("pycolmap", "colmap")),
 }
 """Packages of figures besides the encoders', and the extras that provide them."""
@@ -156,17 +151,7 @@ def measure_consistency(
             values[figure][f"{one} to {two}"] = found[figure.key]
     for figure in wanted:
         row = values[figure]
-        value = of_views(row, np.median if figure is _DISTANCE else np.mean)
-        if figure in _TSED and np.isnan(list(values[_DISTANCE].values())).all():
-            value = float("nan")  # no pair has enough matches
-        done.rows.append(Row(figure.key, figure.title, value, row, figure.encoder))
-    few = sum(np.isnan(value) for value in values.get(_DISTANCE, {}).values())
-    if few:
-        done.notes.append(
-            f"{few} of {len(names) - 1} pairs have fewer than {LEAST_MATCHES} SIFT matches"
-            " or one centre of projection: they have no epipolar distance, and those with too few"
-            " matches count against TSED, whatever the edit did"
-        )
+        done.rows.append(Row(figure.key, figure.title, of_views(row), row, figure.encoder))
     if together:
         (found,) = results(store, [_reconstruction(pairs, names)], 1, report)
         every = f"all {len(names)}"
@@ -262,17 +247,12 @@ class _Pairs:
         self.wanted, self.loaded = tuple(wanted), loaded
         self._view: Callable[[str], _View] = lru_cache(maxsize=2)(self._read)
         self._small: Callable[[str], _View] = lru_cache(maxsize=2)(self._reduced)
-        self._keypoints = lru_cache(maxsize=2)(
-            lambda name: metrics.sift_features(self._view(name).edited, str(self.edited[name]))
-        )
         self._surface = lru_cache(maxsize=2)(self._rendered)
         self._encoded = lru_cache(maxsize=16)(self._features)
 
     def figures(self, one: str, two: str) -> dict[str, float]:
         """Figures of a view and the next, by key; NaN where undefined."""
         values: dict[str, float] = {}
-        if _DISTANCE in self.wanted:
-            values |= self._epipolar(one, two)
         a, b = self._small(one), self._small(two)
         if _FLOW in self.wanted:
             values[_FLOW.key] = _along_flow(a, b)
@@ -295,18 +275,6 @@ class _Pairs:
         if _RENDERED in self.wanted:
             values |= self._at_depth(one, two)
         return {figure.key: values[figure.key] for figure in self.wanted}
-
-    def _epipolar(self, one: str, two: str) -> dict[str, float]:
-        F = fundamental(self._view(one).camera, self._view(two).camera)
-        if F is None:
-            return dict.fromkeys((f.key for f in (*_TSED, _DISTANCE)), float("nan"))
-        matches = metrics.match_features(self._keypoints(one), self._keypoints(two))
-        result = metrics.tsed([metrics.epipolar_distance(*matches, F)])
-        median = float(result.medians[0])
-        # A pair with too few matches counts as inconsistent.
-        return {_DISTANCE.key: median} | {
-            figure.key: float(median < limit) for figure, limit in zip(_TSED, LIMITS, strict=True)
-        }
 
     def _at_depth(self, one: str, two: str) -> dict[str, float]:
         from attnwarp.warp import PRESETS, warp_surfaces

@@ -71,14 +71,6 @@ def test_every_figure_is_that_of_its_function(capture, tmp_path):
     before = [read_picture(path) for path in dataset.image_paths]
     pairs = [f"{one} to {two}" for one, two in itertools.pairwise(names)]
     assert all(list(row["views"]) == pairs for row in rows.values())
-    exact = metrics.tsed_of_views(after, dataset.cameras)
-    nan = lambda values: [np.nan if v is None else v for v in values]  # noqa: E731
-    np.testing.assert_allclose(
-        nan(rows["consistency.tsed_distance"]["views"].values()), exact.medians, rtol=1e-9
-    )
-    assert nan([rows["consistency.tsed_2px"]["value"]])[0] == pytest.approx(
-        exact.share(2), nan_ok=True
-    )
     flow = metrics.optical_flow(before[0], before[1])
     along = metrics.disagreement_at(after[0], after[1], flow.xy, flow.accepted).delta_e
     assert rows["consistency.flow_delta_e"]["views"][pairs[0]] == pytest.approx(
@@ -175,7 +167,7 @@ def test_what_is_missing_is_named_with_its_figures(capture, tmp_path, monkeypatc
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "cv2" else find(n))
     _, output = measured(capture, tmp_path / "out", "--perceptual", "none")
-    assert "Epipolar distance: needs the package cv2" in output
+    assert "Flow warp error: needs the package cv2" in output
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,10 @@ def test_the_committed_report_names_every_case_by_its_number_and_its_sweeps():
     rows = set(re.findall(r"^\| (\d+) \| `(\w+)`: ", text, re.MULTILINE))
     assert {int(number) for number, _ in rows} == set(range(1, 67))
     cases = hard_cases().values()  # 67 and 68 are younger than the report
-    assert rows == {(str(case.number), case.name) for case in cases if case.number <= 66}
+    now = {(str(case.number), case.name) for case in cases if case.number <= 66}
+    # Cases of metrics that are gone.
+    gone = {("64", "epipolar_baseline"), ("65", "few_matches"), ("66", "dark_pictures")}
+    assert rows == now | gone
 
 
 def test_every_row_of_the_tables_is_a_case():

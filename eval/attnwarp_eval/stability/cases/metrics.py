@@ -9,7 +9,6 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 
-from attnwarp.camera import SAME_PLACE, Camera, fundamental
 from attnwarp_eval import metrics
 from attnwarp_eval.metrics.embedding import TINY_DISPLACEMENT, TINY_NORM
 from attnwarp_eval.stability.case import Bound, Way, hard, ways
@@ -131,93 +130,6 @@ def _ends(distance: float, way: Way) -> float:
     return against(exact, compared(low, high, "odds", counts=(count, count)))
 
 
-def _baseline(distance: float, way: Way) -> float:
-    """Error of the epipolar distances of matches that miss their partners by 3 px, of two cameras a
-    distance apart, undefined below the declared one.
-    """
-    rng = np.random.default_rng(0)
-    cameras = [
-        Camera.look_at(
-            (place, -3.0, 0.5), (0.2, 0.1, 0.0), width=256, height=256, fov_y=50, up=(0, 0, 1)
-        )
-        for place in (0.0, distance)
-    ]
-    points = rng.uniform(-0.5, 0.5, (12, 3))
-    pixels = [camera.project(points)[0] for camera in cameras]
-    pixels[1] = pixels[1] + 3 * rng.normal(size=(12, 2))
-    F = fundamental(*cameras)
-    if F is None:
-        return float(distance > SAME_PLACE * 2 * np.linalg.norm(cameras[0].position) + 1e-15)
-    source, target = (xy.astype(way.numpy) for xy in pixels)
-    found = metrics.epipolar_distance(source, target, F)
-    expected = _symmetric_distances(cameras, [source, target])
-    return max(map(against, expected, map(float, found)))
-
-
-def _symmetric_distances(cameras: list[Camera], pixels: list[np.ndarray]) -> list[float]:
-    """Epipolar distances from the cameras' matrices with 60 digits: each line runs through the
-    images of the other's centre and of a point on the match's ray.
-    """
-    with mpmath.workdps(60):
-        K, R, t = (
-            [mpmath.matrix(rows.tolist()) for rows in each]
-            for each in (
-                [camera.K for camera in cameras],
-                [camera.rotation for camera in cameras],
-                [camera.translation for camera in cameras],
-            )
-        )
-        turned = [mpmath.inverse(one) for one in R]
-        centers = [-turned[i] * t[i] for i in (0, 1)]
-        sums = [mpmath.mpf(0)] * len(pixels[0])
-        for i, j in ((0, 1), (1, 0)):
-            epipole = K[j] * (R[j] * centers[i] + t[j])
-            for n, (x, y) in enumerate(pixels[i].tolist()):
-                ray = turned[i] * mpmath.inverse(K[i]) * mpmath.matrix([x, y, 1])
-                shown = K[j] * R[j] * ray
-                a, b, c = (
-                    epipole[1] * shown[2] - epipole[2] * shown[1],
-                    epipole[2] * shown[0] - epipole[0] * shown[2],
-                    epipole[0] * shown[1] - epipole[1] * shown[0],
-                )
-                u, v = pixels[j][n].tolist()
-                sums[n] += abs(a * u + b * v + c) / mpmath.sqrt(a * a + b * b)
-        return [float(one / 2) for one in sums]
-
-
-def _matches(count: float, way: Way) -> float:
-    """Error of the median and the share of a pair with few matches, next to one with many."""
-    distances = [Fraction(k * k, 7) for k in range(int(count))]
-    values = np.array([float(one) for one in distances], way.numpy)
-    result = metrics.tsed([values, np.full(20, 0.5, way.numpy)])
-    ordered = sorted(map(float, values))
-    half = len(ordered) // 2
-    middle = (ordered[(len(ordered) - 1) // 2] + ordered[half]) / 2 if len(ordered) >= 10 else None
-    below = 1 + (middle is not None and middle < 2)
-    return max(
-        against(math.nan if middle is None else middle, float(result.medians[0])),
-        against(below / 2, result.share(2)),
-        against(float(middle is None), result.figures()["consistency.tsed_few_matches"]),
-    )
-
-
-def _contrast(contrast: float, way: Way) -> float:
-    """Error in px of SIFT matches between a wall and the wall moved by 16 px; a pair is undefined
-    and counted if there are too few matches, and a black picture has none.
-    """
-    wall = np.kron(np.random.default_rng(0).random((24, 24, 3)), np.ones((8, 8, 1)))
-    wall = (contrast * wall).astype(way.numpy)
-    source, target = metrics.sift_matches(wall[:, :176], wall[:, 16:])
-    if not contrast:
-        return float(len(source))
-    lines = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])  # matches lie in rows of pixels
-    result = metrics.tsed([metrics.epipolar_distance(source, target, lines)])
-    if len(source) < 10:
-        return against(math.nan, float(result.medians[0]))
-    shift = np.median(source - target, axis=0)
-    return max(abs(float(shift[0]) - 16), abs(float(shift[1])), float(result.medians[0]))
-
-
 CASES = [
     hard(
         "long_embedding",
@@ -236,18 +148,5 @@ CASES = [
         _ends,
         (Way("statistics"),),
         bounds=Bound("of a logit", 1e-9, "reports show three digits"),
-    ),
-    hard(
-        "epipolar_baseline",
-        _baseline,
-        FLOATS,
-        bounds=Bound("px", 1e-3, "a thousandth of TSED's smallest limit"),
-    ),
-    hard("few_matches", _matches, FLOATS, bounds=Bound("px", 1e-12, "a mean of two stored values")),
-    hard(
-        "dark_pictures",
-        _contrast,
-        FLOATS,
-        bounds=Bound("px", 0.1, "SIFT finds a blob to a tenth of a pixel"),
     ),
 ]
