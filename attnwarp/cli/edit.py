@@ -20,7 +20,7 @@ from attnwarp.cli.files import (
     warn_of_misfit,
 )
 from attnwarp.cli.options import (
-    MOST_PIXELS,
+    LONGEST_EDIT,
     AntialiasedOption,
     AnywayOption,
     DataArgument,
@@ -112,7 +112,7 @@ def edit(
             " (default: the editor's own size, 128 for a bundled scene).",
             "N",
             min=16,
-            max=MOST_PIXELS,
+            max=LONGEST_EDIT,
         ),
     ] = None,
     alone: Annotated[

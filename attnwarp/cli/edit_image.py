@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from attnwarp.cli.options import (
-    MOST_PIXELS,
+    LONGEST_EDIT,
     SEGMENTER,
     AnywayOption,
     AtOption,
@@ -60,7 +60,7 @@ def edit_image(
             " (default: the editor's own).",
             "N",
             min=16,
-            max=MOST_PIXELS,
+            max=LONGEST_EDIT,
         ),
     ] = None,
     text_guidance: Annotated[

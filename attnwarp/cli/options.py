@@ -26,7 +26,7 @@ PANELS = (
 )  # fmt: skip
 """Panels of the help in order, below the panel of common options."""
 
-MOST_PIXELS = 4096
+LONGEST_EDIT = 4096
 """Longest side of an edit; a larger value is a typing error that would exhaust the memory."""
 
 SEGMENTER = "clip-parts"
