@@ -23,7 +23,7 @@ UNET = {
     "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
     "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D"),
     "cross_attention_dim": 32,
-    "attention_head_dim": 4,
+    "attention_head_dim": 2,  # heads, whatever its name
     "norm_num_groups": 8,
     "sample_size": 8,
 }
@@ -34,11 +34,14 @@ def unet(in_channels=4, seed=0, **changes):
     return UNet2DConditionModel(**{**UNET, "in_channels": in_channels, **changes}).eval()
 
 
-def parts(seed=0):
-    """Autoencoder, text encoder, tokenizer and scheduler."""
+def parts(seed=0, halvings=1):
+    """Autoencoder, text encoder, tokenizer and scheduler; each halving of a picture's side spares
+    the network three quarters of its work.
+    """
     torch.manual_seed(seed)
+    levels = halvings + 1
     vae = AutoencoderKL(
-        block_out_channels=(8, 16), down_block_types=("DownEncoderBlock2D",) * 2, up_block_types=("UpDecoderBlock2D",) * 2,
+        block_out_channels=(8, *(16,) * halvings), down_block_types=("DownEncoderBlock2D",) * levels, up_block_types=("UpDecoderBlock2D",) * levels,
         norm_num_groups=4, latent_channels=4, scaling_factor=0.4,
     ).eval()  # fmt: skip
     vocab, _ = tokens()
@@ -70,21 +73,25 @@ def nearest_steps(alphas, published):
 NO_CHECKER = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
 
 
-def pix2pix():
-    pipe = StableDiffusionInstructPix2PixPipeline(unet=unet(8), **parts(), **NO_CHECKER)
+def pix2pix(halvings=1):
+    own = parts(halvings=halvings)
+    pipe = StableDiffusionInstructPix2PixPipeline(unet=unet(8), **own, **NO_CHECKER)
     pipe.set_progress_bar_config(disable=True)
     return pipe
 
 
-def controlnet():
+def controlnet(halvings=1):
     base = unet(4)
     torch.manual_seed(1)
-    control = ControlNetModel.from_unet(base, conditioning_embedding_out_channels=(8, 8)).eval()
+    control = ControlNetModel.from_unet(
+        base, conditioning_embedding_out_channels=(8,) * (halvings + 1)
+    ).eval()
     for block in (*control.controlnet_down_blocks, control.controlnet_mid_block):
         torch.nn.init.normal_(
             block.weight, std=0.1
         )  # from_unet leaves them zero, which would test nothing
     torch.nn.init.normal_(control.controlnet_cond_embedding.conv_out.weight, std=0.1)
-    pipe = StableDiffusionControlNetPipeline(unet=base, controlnet=control, **parts(), **NO_CHECKER)
+    own = parts(halvings=halvings)
+    pipe = StableDiffusionControlNetPipeline(unet=base, controlnet=control, **own, **NO_CHECKER)
     pipe.set_progress_bar_config(disable=True)
     return pipe

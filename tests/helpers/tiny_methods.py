@@ -78,7 +78,7 @@ def editor():
     """Editor of pictures."""
     net = unet(8, **ONE_LEVEL)
     loud(net)
-    return InstructPix2Pix(net, **parts(), text_guidance=3.0)
+    return InstructPix2Pix(net, **parts(halvings=2), text_guidance=3.0)
 
 
 @pytest.fixture(scope="session")
@@ -86,13 +86,13 @@ def depth_editor():
     """Editor of depth maps."""
     net = unet(4, **ONE_LEVEL)
     torch.manual_seed(1)
-    control = ControlNetModel.from_unet(net, conditioning_embedding_out_channels=(8, 8)).eval()
+    control = ControlNetModel.from_unet(net, conditioning_embedding_out_channels=(8,) * 3).eval()
     for block in (*control.controlnet_down_blocks, control.controlnet_mid_block):
         torch.nn.init.normal_(block.weight, std=0.1)  # from_unet leaves them zero
     torch.nn.init.normal_(control.controlnet_cond_embedding.conv_out.weight, std=0.1)
     loud(net)
     loud(control)
-    return DepthControlNet(net, **parts(), controlnet=control, text_guidance=3.0)
+    return DepthControlNet(net, **parts(halvings=2), controlnet=control, text_guidance=3.0)
 
 
 @pytest.fixture(scope="session")
