@@ -14,74 +14,113 @@ from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
 
 
 def metrics(
-    renders: Annotated[Path | None, option("Folder: renders of the edited scene.")] = None,
+    renders: Annotated[
+        Path | None, option("Measure the renders of the edited scene in this folder.", "FOLDER")
+    ] = None,
     edited: Annotated[
-        Path | None, option("Folder: the edited pictures, named as the renders.")
+        Path | None,
+        option(
+            "Compare the renders with the edited pictures of their names in this folder.",
+            "FOLDER",
+        ),
     ] = None,
     originals: Annotated[
-        Path | None, option("Folder: the views before the edit, named alike.")
+        Path | None,
+        option("Take the views before the edit from this folder, named as the renders.", "FOLDER"),
     ] = None,
-    source_edit: Annotated[Path | None, option("Picture: the edited source view.")] = None,
-    prompt: Annotated[str | None, option("What the edited scene should show.")] = None,
-    source_prompt: Annotated[str | None, option("What the scene showed before.")] = None,
+    source_edit: Annotated[
+        Path | None,
+        option("Compare each render with this picture, the edited source view.", "FILE"),
+    ] = None,
+    prompt: Annotated[
+        str | None,
+        option("Describe the edited scene, for CLIP to compare with the renders.", "WORDS"),
+    ] = None,
+    source_prompt: Annotated[
+        str | None, option("Describe the scene before, for the CLIP of its change.", "WORDS")
+    ] = None,
     clip: Annotated[
-        str | None, option("clip-small, clip:FOLDER or none; clip-small if left out.", "NAME")
+        str | None,
+        option(
+            "Compute the CLIP figures with this encoder: clip-small, clip:FOLDER, or none (default"
+            " clip-small).",
+            "NAME",
+        ),
     ] = None,
     dino: Annotated[
-        str | None, option("dino-small, dinov2:FOLDER or none; dino-small if left out.", "NAME")
+        str | None,
+        option(
+            "Compute the DINO figures with this encoder: dino-small, dinov2:FOLDER, or none"
+            " (default dino-small).",
+            "NAME",
+        ),
     ] = None,
     perceptual: Annotated[
         str | None,
         option(
-            "perceptual-small, lpips:FILE_OR_FOLDER or none; perceptual-small if left out.", "NAME"
+            "Compute the perceptual distance with this network: perceptual-small,"
+            " lpips:FILE_OR_FOLDER, or none (default perceptual-small).",
+            "NAME",
         ),
     ] = None,
     mask: Annotated[
         Path | None,
         option(
-            "Folder: masks named as the renders; white counts for Edit PSNR and the perceptual"
-            " distance. The others "
-            "see whole pictures."
+            "Count the white pixels alone of the masks in this folder, named as the renders, for"
+            " Edit PSNR and the perceptual distance; CLIP and DINO see whole pictures.",
+            "FOLDER",
         ),
     ] = None,
     consistency: Annotated[
         Path | None,
         option(
-            "transforms.json, its folder, or a COLMAP folder: do neighbouring views agree? Its"
-            " pictures are the edited ones, or with --renders those before the edit.",
+            "Measure whether neighbouring views of DATA agree: transforms.json, its folder, or a"
+            " COLMAP folder. Its pictures are the edited ones, or with --renders those before the"
+            " edit.",
             "DATA",
         ),
     ] = None,
     ply: Annotated[
-        Path | None, option("Splats before the edit, for --consistency at rendered depth.")
+        Path | None,
+        option("Warp for --consistency by the depth of these splats before the edit.", "FILE"),
     ] = None,
     depth: Annotated[
-        Path | None, option("Folder of NAME.npy, (H, W) depths, for it in place of rendered ones.")
+        Path | None,
+        option(
+            "Warp for --consistency by the depths NAME.npy, (H, W) in the scene's units, in this"
+            " folder in place of rendered ones.",
+            "FOLDER",
+        ),
     ] = None,
     scores: Annotated[
         Path | None,
         option(
-            "CSV with first, second and columns such as 'MEt3R lower': scores of neighbours by"
-            " a network of yours."
+            "Show the scores of neighbours by a network of yours beside the others: a CSV with"
+            " the columns first, second and others such as 'MEt3R lower'.",
+            "FILE",
         ),
     ] = None,
     colmap: Annotated[
         bool,
         option(
-            "With --consistency, COLMAP's reconstruction of all views too (attnwarp[colmap]).",
+            "Also reconstruct all views by COLMAP for --consistency; needs the extra colmap.",
             None,
             "--colmap",
         ),
     ] = False,
     background: Annotated[
-        str, option("Behind transparent pixels: black, white, or r,g,b in [0, 1].")
+        str,
+        option(
+            "Put this colour behind transparent pixels: black, white, or r,g,b in [0, 1].", "COLOR"
+        ),
     ] = "black",
-    device: Annotated[str, option("cpu or cuda, for real encoders.")] = "cpu",
-    out: Annotated[Path, option("Folder for metrics.json, metrics.md and metrics.html.")] = Path(
-        "runs/metrics"
-    ),
+    device: Annotated[str, option("Run encoders of yours on this device: cpu or cuda.")] = "cpu",
+    out: Annotated[
+        Path,
+        option("Write metrics.json, metrics.md and metrics.html to this folder.", "FOLDER"),
+    ] = Path("runs/metrics"),
     as_json: Annotated[
-        bool, option("Print metrics.json instead of a table.", None, "--json")
+        bool, option("Print metrics.json in place of a table.", None, "--json")
     ] = False,
 ) -> None:
     """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures, or their consistency.
@@ -159,10 +198,13 @@ def _color(text: str) -> tuple[float, float, float]:
 
 
 def encoders(
-    name: Annotated[str | None, typer.Argument(help="Load this one and say what it is.")] = None,
-    as_json: Annotated[bool, option("JSON.", None, "--json")] = False,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Load this encoder and show what it is; without it, list them."),
+    ] = None,
+    as_json: Annotated[bool, option("Print JSON in place of lines.", None, "--json")] = False,
 ) -> None:
-    """The encoders that metrics can use.
+    """List the encoders that metrics can use.
 
     Some ship with the package, others are read from a folder of yours.
     """

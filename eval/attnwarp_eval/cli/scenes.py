@@ -24,7 +24,7 @@ app = typer.Typer(
 
 @app.command("list")
 def list_() -> None:
-    """The scenes that can be named."""
+    """List the scenes that can be named, with their titles."""
     from attnwarp.errors import InputError
     from attnwarp_eval.scene.file import list_scenes, load_scene
 
@@ -40,7 +40,7 @@ def list_() -> None:
 
 @app.command()
 def show(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
 ) -> None:
     """Show what a scene contains, and how its pictures are made."""
     with clear_errors():
@@ -54,13 +54,22 @@ def show(
 
 @app.command()
 def render(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
     out: Annotated[
-        Path | None, option("Folder for the PNG files; runs/scenes/<scene> if left out.")
+        Path | None,
+        option("Write the PNG files to this folder (default runs/scenes/SCENE).", "FOLDER"),
     ] = None,
-    views: Annotated[str | None, option("Only these cameras (comma-separated names).")] = None,
-    size: Annotated[int, option("Image size in px.", min=16, max=4096)] = 256,
-    spp: Annotated[int | None, option("Samples a pixel, not the scene's.", min=1)] = None,
+    views: Annotated[
+        str | None,
+        option("Render these cameras alone, with commas between names (default all).", "NAMES"),
+    ] = None,
+    size: Annotated[
+        int, option("Render pictures of so many px a side.", "PX", min=16, max=4096)
+    ] = 256,
+    spp: Annotated[
+        int | None,
+        option("Take so many samples a pixel (default the scene's own).", "N", min=1),
+    ] = None,
 ) -> None:
     """Render a scene's truth from its cameras: pictures, depth, normals, one sheet of all."""
     with clear_errors():
@@ -77,18 +86,31 @@ def render(
 
 @app.command()
 def export(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
-    out: Annotated[Path, typer.Argument(help="Folder; an export in it is overwritten.")],
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
+    out: Annotated[
+        Path, typer.Argument(help="Folder of the export; one that is there is overwritten.")
+    ],
     views: Annotated[
-        int, option("Views around the scene; every 8th is of the split 'test'.", min=1)
+        int,
+        option("Render so many views around the scene, every 8th of the split 'test'.", "N", min=1),
     ] = 64,
-    size: Annotated[int, option("Image size in px.", min=16, max=4096)] = 256,
-    spp: Annotated[int, option("Samples a pixel.", min=1)] = 16,
-    points: Annotated[int, option("Points scattered about the surfaces.", min=10)] = 5000,
+    size: Annotated[
+        int, option("Render pictures of so many px a side.", "PX", min=16, max=4096)
+    ] = 256,
+    spp: Annotated[int, option("Take so many samples a pixel.", "N", min=1)] = 16,
+    points: Annotated[
+        int, option("Scatter so many points about the surfaces.", "N", min=10)
+    ] = 5000,
     noise: Annotated[
-        float, option("How far, in spacings between the points.", min=0, max=1e6)
+        float,
+        option(
+            "Move points off the surfaces by this standard deviation, in spacings between them.",
+            "NUMBER",
+            min=0,
+            max=1e6,
+        ),
     ] = 0.5,
-    seed: Annotated[int, option("Of the points.", min=0)] = 0,
+    seed: Annotated[int, option("Draw the points from this seed.", "N", min=0)] = 0,
 ) -> None:
     """Write a scene as transforms.json, images and points, which `attnwarp fit` reads."""
     with clear_errors():
@@ -108,9 +130,9 @@ def export(
 
 @app.command()
 def draw(
-    count: Annotated[int, typer.Argument(min=1, help="How many scenes.")],
-    seed: Annotated[int, option("Of the population.", min=0)],
-    out: Annotated[Path, option("Folder for the YAML files.")],
+    count: Annotated[int, typer.Argument(min=1, help="Number of scenes to draw.")],
+    seed: Annotated[int, option("Draw the population of this seed.", "N", min=0)],
+    out: Annotated[Path, option("Write the YAML files to this folder.", "FOLDER")],
     axis: Annotated[
         list[str] | None,
         option(
@@ -119,7 +141,10 @@ def draw(
             "NAME=VALUE",
         ),
     ] = None,
-    meshes: Annotated[Path | None, option("Folder of meshes (GLB, PLY) to put there.")] = None,
+    meshes: Annotated[
+        Path | None,
+        option("Put the meshes (GLB, PLY) of this folder on the ground.", "FOLDER"),
+    ] = None,
 ) -> None:
     """Draw scenes that no one made by hand, with cameras, edits and bounces.
 
@@ -187,12 +212,13 @@ def _check_no_capture(folder: Path) -> None:
 
 @app.command()
 def edits(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
     as_json: Annotated[
-        bool, option("JSON, with the content hash of each result.", None, "--json")
+        bool,
+        option("Print JSON, with the content hash of each edited scene.", None, "--json"),
     ] = False,
 ) -> None:
-    """The edits that a scene names, with what each one asks for and does."""
+    """List the edits that a scene names, with what each one asks for and does."""
     import json
 
     with clear_errors():
@@ -205,7 +231,7 @@ def edits(
 
 @app.command()
 def calibrate(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
 ) -> None:
     """Measure how many bounces of light a scene and its edits need, and write them into its file.
 
@@ -239,22 +265,32 @@ def calibrate(
 @app.command()
 def effects(
     scene: Annotated[
-        str | None, typer.Argument(help="A scene's name, or the path of its YAML.")
+        str | None, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")
     ] = None,
     as_json: Annotated[
-        bool, option("JSON: effects, plan, geometry, everything_on, cost, proof.", None, "--json")
+        bool,
+        option(
+            "Print JSON: effects, plan, geometry, everything_on, cost and proof.", None, "--json"
+        ),
     ] = False,
     prove: Annotated[
-        bool, option("Hold the plan against a rendering with everything on.", None, "--prove")
+        bool,
+        option("Compare the plan with a rendering with everything on.", None, "--prove"),
     ] = False,
     budget: Annotated[
-        float | None, option("Seconds that a proof may render; 60 if left out.", min=1)
+        float | None,
+        option("End a proof's rendering after so many seconds (default 60).", "SECONDS", min=1),
     ] = None,
     every: Annotated[
         bool,
-        option("A table and pictures of every scene; goes on where it was left.", None, "--all"),
+        option(
+            "Write a table and pictures of every scene; started again, it goes on.", None, "--all"
+        ),
     ] = False,
-    out: Annotated[Path | None, option("Folder of --all; runs/effects if left out.")] = None,
+    out: Annotated[
+        Path | None,
+        option("Write the files of --all to this folder (default runs/effects).", "FOLDER"),
+    ] = None,
 ) -> None:
     """Show which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
@@ -318,12 +354,13 @@ def accuracy(
             " garden, far for geometry)."
         ),
     ] = None,
-    out: Annotated[Path, option("Folder for the report, accuracy.json and the figures.")] = Path(
-        "runs/accuracy"
-    ),
-    rounds: Annotated[int, option("Of every timing.", min=3)] = 7,
+    out: Annotated[
+        Path,
+        option("Write the report, accuracy.json and the figures to this folder.", "FOLDER"),
+    ] = Path("runs/accuracy"),
+    rounds: Annotated[int, option("Time each setting in so many rounds.", "N", min=3)] = 7,
 ) -> None:
-    """Error of the truth itself against time, by samples, variant, refinement, visibility."""
+    """Measure the truth's own error against time, by samples, variant, refinement, visibility."""
     with clear_errors():
         from attnwarp_eval.experiments.accuracy import measure
         from attnwarp_eval.experiments.accuracy.write import write

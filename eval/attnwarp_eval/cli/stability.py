@@ -13,14 +13,25 @@ from attnwarp_eval.cli.shell import Regression
 
 
 def stability(
-    case: Annotated[list[str] | None, option("Sweep this case alone; may be repeated.")] = None,
-    list_: Annotated[bool, option("Name the cases, and run none.", None, "--list")] = False,
-    quick: Annotated[bool, option("Three levels of each case.", None, "--quick")] = False,
+    case: Annotated[
+        list[str] | None, option("Sweep this case alone; may be repeated (default all).", "CASE")
+    ] = None,
+    list_: Annotated[
+        bool, option("List the cases by number, and run none.", None, "--list")
+    ] = False,
+    quick: Annotated[
+        bool, option("Take three levels of each case in place of all.", None, "--quick")
+    ] = False,
     out: Annotated[
-        Path | None, option("The run's folder; runs/stability, with what is chosen, if left out.")
+        Path | None,
+        option(
+            "Write the run to this folder, or go on with the run in it (default runs/stability,"
+            " followed by the chosen cases and quick).",
+            "FOLDER",
+        ),
     ] = None,
     jobs: Annotated[
-        int, option("Worker processes; 1 stays in this one.", None, "--jobs", "-j", min=1)
+        int, option("Compute in so many processes, at most one a core.", "N", "--jobs", "-j", min=1)
     ] = 1,
 ) -> None:
     """Sweep numerically hard inputs until the numerics break. Exit code 1 if one breaks too early.

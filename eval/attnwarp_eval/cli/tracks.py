@@ -17,24 +17,38 @@ from attnwarp_eval.cli.shell import clear_errors
 def tracks(
     data: DataArgument,
     ply: Annotated[
-        list[Path] | None, option("Splats fitted to it; may be repeated.", "SPLATS")
+        list[Path] | None, option("Judge these splats, fitted to DATA; may be repeated.", "SPLATS")
     ] = None,
     preset: Annotated[
-        list[str] | None, option("Warp settings; paper and corrected if left out.", "NAME")
+        list[str] | None,
+        option("Warp by this preset; may be repeated (default paper and corrected).", "NAME"),
     ] = None,
     apart: Annotated[
-        list[int] | None, option("Views between a pair, plus 1; 1, 3 and 6 if left out.", min=1)
+        list[int] | None,
+        option(
+            "Warp each view to the one so many places before it; may be repeated (default 1, 3"
+            " and 6).",
+            "N",
+            min=1,
+        ),
     ] = None,
     max_size: Annotated[
-        int, option("Measure in pictures of this many px at most.", "N", min=16)
+        int, option("Shrink pictures to so many px on the longer side.", "PX", min=16)
     ] = 256,
     model: Annotated[
-        Path | None, option("COLMAP's sparse model with tracks; made by pycolmap if left out.")
+        Path | None,
+        option(
+            "Read the tracks from COLMAP's sparse model in this folder (default made by pycolmap).",
+            "FOLDER",
+        ),
     ] = None,
     truth: Annotated[
-        str | None, option("The scene that DATA is an export of: exact geometry.", "SCENE")
+        str | None,
+        option("Compare with the exact geometry of this scene, which DATA exports.", "SCENE"),
     ] = None,
-    out: Annotated[Path, option("Folder for tracks.json and tracks.html.")] = Path("runs/tracks"),
+    out: Annotated[
+        Path, option("Write tracks.json and tracks.html to this folder.", "FOLDER")
+    ] = Path("runs/tracks"),
     *,
     reading: Reading,
 ) -> None:

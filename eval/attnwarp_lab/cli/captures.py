@@ -25,23 +25,41 @@ class One:
 
     data: Annotated[
         Path | None,
-        option("transforms.json, its folder, or one of COLMAP or BlendedMVS.", "DATA", panel=ONE),
+        option(
+            "Measure this capture: transforms.json, its folder, or one of COLMAP or BlendedMVS.",
+            "DATA",
+            panel=ONE,
+        ),
     ] = None
     instruction: Annotated[
-        str | None, option("The edit, for editors that take pictures.", panel=ONE)
+        str | None, option("Say what to change, for editors that take pictures.", panel=ONE)
     ] = None
     target_prompt: Annotated[
         str | None,
         option(
-            "What the edited scene shows, for CLIP and editors that take depth maps.", panel=ONE
+            "Say what the edited scene shows, for CLIP and editors that take depth maps.",
+            panel=ONE,
         ),
     ] = None
     source_prompt: Annotated[
-        str | None, option("What it shows before, for CLIP and methods that invert.", panel=ONE)
+        str | None,
+        option("Say what it shows before, for CLIP and methods that invert.", panel=ONE),
     ] = None
-    ply: Annotated[Path | None, option("Its splats; fitted if left out.", panel=ONE)] = None
-    images: Annotated[Path | None, option("Images of a COLMAP model.", panel=ONE)] = None
-    scale: Annotated[int, option("2, 4 or 8 reads images_N.", "N", panel=ONE)] = 1
+    ply: Annotated[
+        Path | None, option("Edit these splats (default fitted).", "SPLATS", panel=ONE)
+    ] = None
+    images: Annotated[
+        Path | None,
+        option("Read the pictures of a COLMAP model from this folder.", "FOLDER", panel=ONE),
+    ] = None
+    scale: Annotated[
+        int,
+        option(
+            "Read the pictures of images_N, which are so many times smaller: 2, 4 or 8.",
+            "N",
+            panel=ONE,
+        ),
+    ] = 1
     max_size: MaxSizeOption = None
 
     @property

@@ -21,19 +21,29 @@ app = typer.Typer(
 @app.command()
 def build(
     run: Annotated[Path, typer.Argument(help="The folder of a run that edited scenes.")],
-    out: Annotated[Path, option("The page.")] = Path("userstudy.html"),
+    out: Annotated[Path, option("Write the page to this file.", "FILE")] = Path("userstudy.html"),
     method: Annotated[
         list[str] | None,
-        option("Only this variant; may be repeated. All with pictures if left out.", "NAME"),
+        option("Show this variant; may be repeated (default all with pictures).", "NAME"),
     ] = None,
     questions: Annotated[
-        str | None, option("Of instruction, consistency, quality (comma-separated); else all.")
+        str | None,
+        option(
+            "Ask these questions, with commas between: instruction, consistency, quality (default"
+            " all).",
+            "NAMES",
+        ),
     ] = None,
-    choices: Annotated[int, option("Choices of a person.", min=1)] = 30,
-    checks: Annotated[int, option("Attention checks of a person.", min=0)] = 3,
-    plans: Annotated[int, option("Different draws; each person gets one at random.", min=1)] = 20,
-    seed: Annotated[int, option("Of what is drawn.", min=0)] = 0,
-    title: Annotated[str, option("Of the page.")] = "Which edit do you prefer?",
+    choices: Annotated[int, option("Ask each person for so many choices.", "N", min=1)] = 30,
+    checks: Annotated[int, option("Give each person so many attention checks.", "N", min=0)] = 3,
+    plans: Annotated[
+        int,
+        option("Draw so many plans; each person gets one at random.", "N", min=1),
+    ] = 20,
+    seed: Annotated[int, option("Draw the plans from this seed.", "N", min=0)] = 0,
+    title: Annotated[
+        str, option("Show this title on the page.", "WORDS")
+    ] = "Which edit do you prefer?",
 ) -> None:
     """Make one self-contained page of two-way choices between the methods of a run.
 
@@ -66,9 +76,12 @@ def score(
     answers: Annotated[
         list[Path], typer.Argument(metavar="ANSWERS...", help="Files that people saved.")
     ],
-    out: Annotated[Path | None, option("Folder for preferences.json, .md and .html.")] = None,
+    out: Annotated[
+        Path | None,
+        option("Write preferences.json, .md and .html to this folder.", "FOLDER"),
+    ] = None,
 ) -> None:
-    """Selection frequency of each method, with intervals, and who failed attention checks."""
+    """Score each method by its selections, with intervals, and name who failed attention checks."""
     import json
 
     from rich.console import Console
