@@ -53,7 +53,11 @@ from attnwarp.reporting import SILENT
 from attnwarp.warp import lift_masks, piece_around
 
 runner = CliRunner()
-QUICK = shlex.split("--steps 2 --iterations 3 --stages 2 --views-per-stage 1 --size 32 --threads 1")
+QUICK = shlex.split(
+    "--steps 1 --iterations 1 --stages 2 --views-per-stage 1 --size 32 --threads 1 --no-control"
+)
+ONE = ("--stages", 1, "--iterations", 0)
+"""For what neither tuning nor a second stage tells."""
 
 
 LEFT = np.arange(32) < np.full((32, 1), 16)
@@ -84,7 +88,7 @@ def place(tmp_path_factory):
         folder / "data", Dataset(views, paths, points, np.full(points.shape, 99, np.uint8))
     )
     write_ply(folder / "splats.ply", model)
-    pix2pix().save_pretrained(folder / "editor")
+    pix2pix(halvings=2).save_pretrained(folder / "editor")
     save_mask(LEFT & False, *(folder / "black" / camera.name for camera in views))
     (folder / "ones").mkdir()
     for camera in views:
@@ -100,7 +104,7 @@ def run(place, out, *more, instruction="a bear"):
 
 
 def test_it_leaves_an_edited_ply_and_a_page(place, tmp_path):
-    result = run(place, tmp_path, "--ply", place / "splats.ply", "--source", "v2.png")
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--source", "v2.png", "--control")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines()[-1] == str(tmp_path / "index.html")
     edited = read_ply(tmp_path / "edited.ply")
@@ -128,7 +132,7 @@ def test_a_source_that_the_fit_held_out_is_told_on_the_page_too(place, tmp_path,
         (tmp_path / "place/data/transforms.json").write_text(json.dumps({**scene, **splits}))
     for source, told in (("v2.png", True), ("v1.png", False)):
         ply = ("--ply", tmp_path / "place" / "splats.ply")
-        result = run(tmp_path / "place", tmp_path / source, *ply, "--source", source)
+        result = run(tmp_path / "place", tmp_path / source, *ply, "--source", source, *ONE)
         assert result.exit_code == 0, result.output
         page = (tmp_path / source / "index.html").read_text()
         for said in (" ".join(result.stderr.split()), page):
@@ -136,7 +140,7 @@ def test_a_source_that_the_fit_held_out_is_told_on_the_page_too(place, tmp_path,
 
 
 def test_a_bundled_editor_says_that_photographs_are_not_its_world(place, tmp_path):
-    more = ("--editor", "small-plain", "--no-control", "--stages", 1, "--iterations", 1)
+    more = ("--editor", "small-plain", *ONE)
     ply = ("--ply", place / "splats.ply")
     done = run(place, tmp_path, *ply, *more, instruction="make it red")
     assert done.exit_code == 0, done.output
@@ -155,7 +159,7 @@ def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_pat
     for frame in scene["frames"]:
         frame["file_path"] = frame["file_path"].replace("v0.png", name)
     (data / "transforms.json").write_text(json.dumps(scene))
-    result = run(tmp_path / "place", tmp_path / "edit", "--ply", place / "splats.ply")
+    result = run(tmp_path / "place", tmp_path / "edit", "--ply", place / "splats.ply", *ONE)
     assert result.exit_code == 0, result.output
     assert "f?r" in (tmp_path / "edit" / "index.html").read_text(encoding="utf-8")
 
@@ -211,7 +215,7 @@ def test_a_captures_masks_and_its_fits_exposures_hold_in_the_edit(place, tmp_pat
     scene = json.loads((data / "transforms.json").read_text())
     scene["frames"][1]["mask_path"] = "mask.png"
     (data / "transforms.json").write_text(json.dumps(scene))
-    fitted = ["--iterations", 60, "--hold-out", 0, "--set", "exposure=true", "--kind", "2dgs"]
+    fitted = ["--iterations", 30, "--hold-out", 0, "--set", "exposure=true", "--kind", "2dgs"]
     done = runner.invoke(app, ["fit", str(data), "--out", str(tmp_path / "fit"), *map(str, fitted)])
     assert done.exit_code == 0, done.output
     seen, advance = {}, Tuning.advance
@@ -241,6 +245,7 @@ def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     (tmp_path / "hand.png").write_bytes(encode_png(hand))
     result = run(
         place, tmp_path / "out", "--ply", place / "splats.ply", "--masks", masks, "--source-picture", tmp_path / "hand.png",
+        *ONE,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     source = read_image(tmp_path / "out" / "views/v0.png")
@@ -255,13 +260,13 @@ def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(place, tm
     save_sam(tmp_path / "sam", seed=2)
     ply = ("--ply", place / "splats.ply")
     segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
-    result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
+    result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter, *ONE)
     assert result.exit_code == 0, result.output
     (made,) = (tmp_path / "words" / "words").rglob("*.png")
     source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
     direct = GroundedSam.from_folders(tmp_path / "dino", tmp_path / "sam")
     assert np.array_equal(read_image(made)[..., 0] > 127, direct.segment(source, "bear"))
-    result = run(place, tmp_path / "file", *ply, "--mask", made)
+    result = run(place, tmp_path / "file", *ply, "--mask", made, *ONE)
     assert result.exit_code == 0, result.output
     assert "--mask marks" in result.stderr and "lifted through the splats" in result.stderr
     for name in ("views/v0.png", "edited.ply", "segments/v1.png"):
@@ -271,7 +276,7 @@ def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(place, tm
 def test_a_mask_of_the_source_is_lifted_into_every_view(place, tmp_path):
     """Oracle: the library's lifting, and the photographs where it marks nothing."""
     out, mask = tmp_path / "out", save_mask(LEFT, tmp_path / "mask.png")
-    result = run(place, out, "--ply", place / "splats.ply", "--mask", mask)
+    result = run(place, out, "--ply", place / "splats.ply", "--mask", mask, *ONE)
     assert result.exit_code == 0, result.output
     model, views = read_ply(place / "splats.ply"), cameras()
     lifted = lift_masks(model, views[:1], [LEFT], near=near_of(views, model))
@@ -295,14 +300,14 @@ def test_a_box_marks_what_opencv_cuts_out_and_a_click_its_surface(place, tmp_pat
     else:
         mask = snap(source, piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20)))
     file, ply = save_mask(mask, tmp_path / "mask.png"), ("--ply", place / "splats.ply")
-    done = run(place, tmp_path / "a", *ply, option, value)
+    done = run(place, tmp_path / "a", *ply, option, value, *ONE)
     assert done.exit_code == 0
     assert f"{option} {value} of 32 x 32 px marks" in " ".join(done.stderr.split())
     lit = read_image(tmp_path / "a" / "marked.png").astype(float)
     shown = 255 * source * np.where(mask, 1, 0.3)[..., None]
     drawn = (np.abs(lit - shown) > 1).any(-1)  # the box or the cross
     assert 0 < drawn.mean() < 0.5 and drawn[:4].sum() < 60
-    assert run(place, tmp_path / "b", *ply, "--mask", file).exit_code == 0
+    assert run(place, tmp_path / "b", *ply, "--mask", file, *ONE).exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
         assert one == two
@@ -560,7 +565,7 @@ def test_an_edit_begins_with_how_much_it_changed_inside_the_mask(place, tmp_path
     """Oracle: scikit-image on the files of the folder."""
     mask = save_mask(LEFT, tmp_path / "mask.png")
     out, ply = tmp_path / "out", ("--ply", place / "splats.ply")
-    result = run(place, out, *ply, "--mask", mask, "--iterations", 0)
+    result = run(place, out, *ply, "--mask", mask, *ONE)
     assert result.exit_code == 0, result.output
     inside = read_image(out / "segments" / "v0.png")[..., 0] > 127
     source = read_image(place / "data" / "images" / "v0.png")
@@ -605,7 +610,7 @@ def test_the_change_of_a_scene_is_net_of_what_tuning_alone_changes(
 def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(place, tmp_path):
     shutil.copytree(place, tmp_path / "copy")
     ply = ("--ply", place / "splats.ply")
-    first = run(tmp_path / "copy", tmp_path / "out", *ply)
+    first = run(tmp_path / "copy", tmp_path / "out", *ply, *ONE)
     assert first.exit_code == 0, first.output
     for picture in (tmp_path / "copy/data/images").iterdir():
         picture.write_bytes(b"")
@@ -616,7 +621,7 @@ def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(
         (("--source", 1), 'other options.source (null, now "1")'),
         (("--max-size", 16), 'other options.max_size (null, now "16")'),
     ):
-        again = run(tmp_path / "copy", tmp_path / "out", *ply, *more)
+        again = run(tmp_path / "copy", tmp_path / "out", *ply, *ONE, *more)
         message = f"holds an edit of {message}"
         assert again.exit_code == 2 and message in again.output
 
@@ -654,7 +659,7 @@ def test_splats_that_do_not_show_the_pictures_are_warned_about(how, place, tmp_p
         spreads.append((true - true.mean(0)) ** 2)
     psnr, plain = (-10 * np.log10(np.concatenate(x).mean()) for x in (errors, spreads))
     assert (psnr < min(plain, 18)) == (how != "as they are")
-    result = run(place, tmp_path / "out", "--ply", tmp_path / "moved.ply", "--stages", 1)
+    result = run(place, tmp_path / "out", "--ply", tmp_path / "moved.ply", *ONE)
     assert result.exit_code == 0, result.output
     said = f"are unlike them ({psnr:.1f} dB; one colour a view would have {plain:.1f})"
     assert (said in result.stderr) == (how != "as they are")
@@ -672,7 +677,7 @@ def test_the_kind_that_a_person_names_is_that_of_the_splats_that_are_given(place
     (tmp_path / "thick.ply").write_bytes(b"\n".join([*lines, b"end_header\n"]) + body)
     for kind, ending in (("2dgs", "2d"), ("3dgs", "3d")):
         out = tmp_path / kind
-        result = run(place, out, "--ply", tmp_path / "thick.ply", "--kind", kind, "--stages", 1)
+        result = run(place, out, "--ply", tmp_path / "thick.ply", "--kind", kind, *ONE)
         assert result.exit_code == 0, result.output
         assert read_ply(out / "edited.ply").kind == ending
     result = run(place, tmp_path / "none", "--no-antialiased")
@@ -697,7 +702,7 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     for k, camera in enumerate(cameras()):
         save_mask(np.full((32, 32), k == 2), masks / camera.name)
     ply = ("--ply", place / "splats.ply", "--source", 2, "--set", "warp.segment=true")
-    result = run(place, tmp_path / "out", *ply, "--masks", masks)
+    result = run(place, tmp_path / "out", *ply, "--masks", masks, *ONE)
     assert result.exit_code == 0, result.output
     names = ", ".join(f"images/v{k}.png" for k in (0, 1, 3, 4))
     assert f"--masks: 4 of 5 are black, so nothing is edited in {names}\n" in result.stderr
@@ -706,7 +711,7 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     page = unescape((tmp_path / "out" / "index.html").read_text())
     warned = re.findall(r"^attnwarp: warning: (.*)$", result.stderr, re.MULTILINE)
     assert len(warned) >= 2 and all(f"<b>Warning:</b> {text}." in page for text in warned)
-    result = run(place, tmp_path / "all", *ply)
+    result = run(place, tmp_path / "all", *ply, *ONE)
     assert result.exit_code == 0 and "edited alone" not in result.stderr
     assert "in place of" not in result.stderr
 
@@ -759,10 +764,10 @@ def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_pa
     masks, segments = tmp_path / "masks", tmp_path / "out" / "segments"
     save_mask(LEFT, *(masks / camera.name for camera in cameras()))
     given = {path.name: path.read_bytes() for path in masks.iterdir()}
-    assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
+    assert run(place, tmp_path / "out", *ply, "--masks", masks, *ONE).exit_code == 0
     assert {path.name: path.read_bytes() for path in segments.iterdir()} == given
     save_mask(~LEFT, masks / cameras()[0].name)
-    result = run(place, tmp_path / "out", *ply, "--masks", masks)
+    result = run(place, tmp_path / "out", *ply, "--masks", masks, *ONE)
     assert result.exit_code == 2
     assert "holds an edit of other inputs.segments" in result.output
     assert {path.name: path.read_bytes() for path in segments.iterdir()} == given

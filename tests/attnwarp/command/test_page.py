@@ -23,7 +23,7 @@ from attnwarp.methods import METHODS, attention_warping, by_view, preset
 from attnwarp.methods.base import workdir_of
 from attnwarp.trial import disc
 
-QUICK = {"steps": 2, "iterations": 3}
+QUICK = {"steps": 2, "iterations": 1}
 
 
 class Page(HTMLParser):
