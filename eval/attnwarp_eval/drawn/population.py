@@ -30,13 +30,6 @@ class _Scenes(Spec, ABC):
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     axes: dict[str, float] = Field(default_factory=dict)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_stored_runs(cls, data: Any) -> Any:
-        """Runs and committed results have an empty key of an older version."""
-        empty = isinstance(data, dict) and data.get("stratify") in ([], ())
-        return {k: v for k, v in data.items() if k != "stratify"} if empty else data
-
     @model_validator(mode="after")
     def _known_axes(self) -> Self:
         check_axes(self.axes)

@@ -104,6 +104,8 @@ def read_raw(path: Path) -> Results:
 
 def _study(data: Any) -> Study:
     """Parse the study of raw results, with old keys and values translated to this version."""
+    if data.get("population"):
+        data["population"].pop("stratify", None)  # empty in committed results
     for variant in data.get("variants", {}).values():
         if variant.get("options", {}).get("method") == "each view alone":
             # Committed results have it, for edits bit-identical to those with a0: 0.

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
@@ -100,13 +100,6 @@ class VariantPart(Part):
     editor: EditorPart | None = None
     control: Control | None = None
     drift: DriftPart | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_budget(cls, data: Any) -> Any:
-        # Stored runs have the key, which is null where a variant had no budget.
-        kept = isinstance(data, dict) and data.get("budget", 0) is None
-        return {k: v for k, v in data.items() if k != "budget"} if kept else data
 
 
 class MethodProbe(Probe[E]):
