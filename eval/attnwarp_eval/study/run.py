@@ -296,7 +296,7 @@ def execute(
     """
     start = time.perf_counter()
     store.write_study(expected(plan))
-    cells = CellReporter(plan.todo, plan.reused, report)
+    cells = CellReporter(len(plan.todo), plan.reused, report)
     failures = compute_cells(
         plan.todo, store, cells, jobs=min(jobs, core_count()), scheduler=scheduler,
         scenes=plan.scenes, keep_going=keep_going,

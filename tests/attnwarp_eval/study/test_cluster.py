@@ -281,7 +281,7 @@ def test_a_worker_that_cannot_read_what_its_cells_need_is_refused_by_name(tmp_pa
     needs = [tmp_path, tmp_path / "nowhere"]
     place = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
     with LocalCluster(1, processes=False, threads_per_worker=1, memory_limit=0, **place) as cluster:
-        report = CellReporter(cells, 0, SILENT)
+        report = CellReporter(len(cells), 0, SILENT)
         address = cluster.scheduler_address
         work = module.run_on_scheduler(cells, Store(tmp_path), {}, address, report, needs)
         with pytest.raises(module.ClusterError) as raised:
@@ -317,7 +317,7 @@ def test_a_worker_gets_a_scenes_files_again_when_it_comes_back_or_a_cell_of_it_f
     cell = cluster.Cell({}, "ball", "v", "warp", 0)
     place, sent = cluster._Remote(Store("none"), {"ball": None}), []
     client = SimpleNamespace(submit=lambda do, probe, cell, files, **_: sent.append(files))
-    runner = cluster._Runner(client, [], place, CellReporter([], 0, SILENT))
+    runner = cluster._Runner(client, [], place, CellReporter(0, 0, SILENT))
     for worker in ("tcp://a:1", "tcp://a:1", "tcp://b:1"):
         place.submit(client, worker, cell)
     assert sent == ["files", None, "files"]
