@@ -7,10 +7,8 @@ returns a picture; Pillow, which refuses such a file, therefore decodes the file
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import re
-import struct
 import tempfile
 import threading
 import warnings
@@ -63,8 +61,8 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         >>> image_size("image.png")
         (3, 2)
     """
-    path = existing_file(path)
-    size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size, _unturned(path))
+    path = _readable(path)
+    size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size)
     if size is None:
         height, width = read_image(path).shape[:2]
         return width, height
@@ -92,9 +90,7 @@ def orientation(path: str | os.PathLike[str]) -> int:
             return image.getexif().get(_ORIENTATION, 1)
         return 1
 
-    path = existing_file(path)
-    tags = _tiff_tags(path)  # Pillow cannot open the pixels of every TIFF
-    turn: Any = _with_pillow(path, asked) if tags is None else tags.get(_ORIENTATION)
+    turn: Any = _with_pillow(existing_file(path), asked)
     return int(turn) if turn in range(1, 9) else 1
 
 
@@ -173,10 +169,9 @@ def read_image(
     """
     import cv2
 
-    path = existing_file(path)
-    tiff = _unturned(path)
-    rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
-    data = path.read_bytes() if tiff is None else tiff
+    path = _readable(path)
+    rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv)
+    data = path.read_bytes()
     # Some decoders skip PNG checksums, and damage would become pixels.
     if data.startswith(_PNG) and not _with_pillow(path, lambda image: image.verify() or True):
         raise FileFormatError(path, "the picture is damaged; replace it or leave it out")
@@ -254,7 +249,7 @@ def weighted_by_alpha(
     return np.round(np.clip(values, 0, 1) * top).astype(image.dtype)
 
 
-def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = None) -> Any:
+def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
     """Open a picture with Pillow and return ``use`` of it; an error message has one line.
 
     Formats unknown to Pillow, such as TIFF of 16 bits and three channels, return None.
@@ -265,7 +260,7 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
         with warnings.catch_warnings():
             # Pillow's warnings of a large picture or an odd tag are ignored.
             warnings.simplefilter("ignore")
-            with Image.open(path if data is None else io.BytesIO(data)) as image:
+            with Image.open(path) as image:
                 return use(image)
     except UnidentifiedImageError:
         return None
@@ -345,56 +340,36 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
 _ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
 """TIFF tags of the orientation, the bits of each channel, and the number of channels."""
 
-_BIG = 43
-"""Version number of a BigTIFF, 42 in a plain TIFF."""
-
 _FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 """Axes to flip by EXIF orientation, after transposing for orientations from 5 on."""
 
 
-def _tiff_tags(path: Path) -> dict[int, Any] | None:
-    """Read the tags of a TIFF's first picture needed for reading, with the directory's offset under
-    0; None for any other file.
+def _readable(path: str | os.PathLike[str]) -> Path:
+    """Return the path of an existing file, but for a TIFF that OpenCV or Pillow reads otherwise
+    than it is stored: they turn the pixels of this format by its tag, and of 16-bit grey with alpha
+    OpenCV reads 8 bits without alpha.
     """
     from PIL.TiffImagePlugin import PREFIXES, ImageFileDirectory_v2
 
-    tags: dict[int, Any] = {}
+    path = existing_file(path)
     with path.open("rb") as stream:
         head = stream.read(8)
         if not head.startswith(tuple(PREFIXES)):
-            return None
+            return path
+        if 43 in head[2:4]:
+            raise FileFormatError(path, "is a BigTIFF; convert it to PNG")
+        tags: dict[int, Any] = {}
         # Decoders report damage; here it can raise any exception in Pillow.
         with warnings.catch_warnings(), contextlib.suppress(Exception):
             warnings.simplefilter("ignore")
-            header = head
-            if _BIG in head[2:4]:  # Pillow recognises BigTIFF only by II's third byte
-                header = b"II" + bytes([_BIG, 0]) + head[4:] + stream.read(8)
-            directory = ImageFileDirectory_v2(header, head[:2])
-            tags[0] = stream.seek(directory.next)
+            directory = ImageFileDirectory_v2(head)
+            stream.seek(directory.next)
             directory.load(stream)
-            tags |= {t: directory[t] for t in (_ORIENTATION, _SAMPLES) if t in directory}
-            tags[_BITS] = int(max(directory[_BITS]))
-    return tags
-
-
-def _unturned(path: Path) -> bytes | None:
-    """Return a TIFF's bytes with its orientation tag reset: OpenCV and Pillow always rotate the
-    pixels of this format. None for any other file.
-
-    Raises:
-        FileFormatError: 16-bit grey with alpha, which OpenCV reads as 8 bits without alpha.
-    """
-    tags = _tiff_tags(path)
-    if tags is None:
-        return None
-    if tags.get(_SAMPLES) == 2 and tags.get(_BITS, 8) > 8:
+            tags = {t: directory[t] for t in (_ORIENTATION, _BITS, _SAMPLES) if t in directory}
+    if tags.get(_ORIENTATION) in range(2, 9):
+        raise FileFormatError(path, "asks to be turned by a tag; convert it to an upright PNG")
+    if tags.get(_SAMPLES) == 2 and tags.get(_BITS) == (16, 16):
         raise FileFormatError(
             path, "grey of 16 bits with alpha, which cannot be read as TIFF; convert it to PNG"
         )
-    data = path.read_bytes()
-    if tags.get(_ORIENTATION, 1) not in range(2, 9):
-        return data
-    order = "<" if data.startswith(b"II") else ">"
-    entry = struct.Struct(f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H")  # and the value
-    turned, upright = (entry.pack(_ORIENTATION, 3, 1, v) for v in (tags[_ORIENTATION], 1))
-    return data[: tags[0]] + data[tags[0] :].replace(turned, upright, 1)
+    return path

@@ -28,89 +28,44 @@ def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
     assert image[:, 0].min() > 200 and image[:, -1].max() < 50
 
 
-def tiff(pixels, turn, order, big):
-    """A TIFF of one strip by its specification, with a tag that asks for a turn."""
-    height, width, channels = pixels.shape
-    bits = 8 * pixels.itemsize
-    head = 16 if big else 8
-    data = pixels.astype(pixels.dtype.newbyteorder(order)).tobytes()
-    deep = struct.pack(f"{order}{channels}H", *[bits] * channels)
-    place = head + len(data)
-    wide = "Q" if big else "I"
-    tags = [
-        (256, 3, 1, width), (257, 3, 1, height), (258, 3, channels, place), (259, 3, 1, 1),
-        (262, 3, 1, 2 if channels > 2 else 1), (273, 4, 1, head), (274, 3, 1, turn), (277, 3, 1, channels),
-        (278, 3, 1, height), (279, 4, 1, len(data)),
-        *([(338, 3, 1, 2)] if channels % 2 == 0 else []),
-    ]  # fmt: skip
-    fields = b""
-    for tag, kind, count, value in tags:
-        size = {3: 2, 4: 4}[kind]
-        room = 8 if big else 4
-        own = struct.pack(f"{order}{'H' if size == 2 else 'I'}", value).ljust(room, b"\0")
-        if size * count > room:
-            own = struct.pack(f"{order}{wide}", place)
-        elif count > 1:
-            own = deep.ljust(room, b"\0")
-        fields += struct.pack(f"{order}HH{wide}", tag, kind, count) + own
-    mark = b"II" if order == "<" else b"MM"
-    start = place + len(deep)
-    first = (
-        struct.pack(f"{order}HHHQ", 43, 8, 0, start)
-        if big
-        else struct.pack(f"{order}HI", 42, start)
-    )
-    number = struct.pack(f"{order}{'Q' if big else 'H'}", len(tags))
-    return mark + first + data + deep + number + fields + bytes(8 if big else 4)
-
-
 @pytest.mark.parametrize("turn", range(1, 9))
-@pytest.mark.parametrize("shape", [(4, 6, 3), (5, 5, 4)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize(("order", "big"), [("<", False), (">", False), ("<", True), (">", True)])
-def test_a_tiff_that_asks_to_be_turned_comes_as_it_is_stored(
-    tmp_path, turn, shape, dtype, order, big
-):
-    """Oracle: the pixels of a file written by the format's specification."""
-    top = np.iinfo(dtype).max
-    pixels = np.random.default_rng(0).integers(0, top, shape, dtype=dtype, endpoint=True)
-    pixels[..., 3:] = top
-    path = tmp_path / "a.tif"
-    path.write_bytes(tiff(pixels, turn, order, big))
-    image = read_image(path)
-    np.testing.assert_array_equal(image, pixels)
-    assert image.dtype == dtype
-    assert image_size(path) == (shape[1], shape[0])
-
-
-@pytest.mark.parametrize("turn", range(1, 9))
-@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp", "deep.tif"])
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
 def test_an_upright_picture_is_what_viewers_show(tmp_path, turn, name):
-    """Oracle: Pillow's own turning; of 16 bits, which Pillow does not open, that of the 8 above."""
+    """Oracle: Pillow's own turning."""
     pixels = np.random.default_rng(turn).integers(0, 256, (4, 6, 3), dtype=np.uint8)
     tags = Image.Exif()
     tags[0x112] = turn
     path = tmp_path / name
-    if name == "deep.tif":
-        path.write_bytes(tiff(pixels.astype(np.uint16) * 257, turn, ">", False))
-        Image.fromarray(pixels).save(tmp_path / "a.png", exif=tags)
-    else:
-        Image.fromarray(pixels).save(path, exif=tags)
-    with Image.open(path if name != "deep.tif" else tmp_path / "a.png") as stored:
+    Image.fromarray(pixels).save(path, exif=tags)
+    with Image.open(path) as stored:
         seen = np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))
-    upright = read_upright(path)
-    np.testing.assert_array_equal(upright // (257 if name == "deep.tif" else 1), seen)
+    np.testing.assert_array_equal(read_upright(path), seen)
     assert upright_size(path) == seen.shape[1::-1]
     # A tag that the picture of a pose has too turns neither.
     np.testing.assert_array_equal(read_upright(path, beside=path), read_image(path))
 
 
-def test_a_bigtiff_whose_directory_lies_beyond_all_memory_is_refused_in_one_line(tmp_path):
+@pytest.mark.door
+@pytest.mark.parametrize(("big", "turn", "words"), [(False, 3, "turned"), (True, 1, "BigTIFF")])
+@pytest.mark.parametrize("mode", ["RGB", "I;16"])
+def test_a_tiff_whose_pixels_decoders_would_turn_is_refused(tmp_path, mode, big, turn, words):
     path = tmp_path / "a.tif"
-    path.write_bytes(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 2**63 + 5))
+    Image.new(mode, (4, 3)).save(path, tiffinfo={274: turn}, big_tiff=big)
     for read in (read_image, image_size):
-        with pytest.raises(FileFormatError, match=r"a\.tif"):
+        with pytest.raises(FileFormatError, match=rf"a\.tif: .*{words}.* PNG"):
             read(path)
+
+
+@pytest.mark.parametrize("shape", [(4, 6, 3), (5, 5, 4)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_an_upright_tiff_is_read_in_its_depth(tmp_path, shape, dtype):
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype=dtype)
+    pixels[..., 3:] = np.iinfo(dtype).max
+    order = [2, 1, 0, 3][: shape[2]]
+    cv2.imwrite(str(tmp_path / "a.tif"), pixels[..., order])
+    image = read_image(tmp_path / "a.tif")
+    np.testing.assert_array_equal(image, pixels)
+    assert image.dtype == dtype and image_size(tmp_path / "a.tif") == shape[1::-1]
 
 
 def test_files_come_as_rgb_in_their_own_depth(tmp_path):
@@ -290,18 +245,15 @@ def test_a_folder_whose_name_is_no_utf8_is_read(tmp_path):
 
 @pytest.mark.door
 def test_a_grey_tiff_of_16_bits_with_alpha_is_refused(tmp_path):
-    """OpenCV halves its depth and drops its alpha."""
-    pixels = np.zeros((8, 8, 2), np.uint16)
-    pixels[..., 0], pixels[:4, :, 1] = 30000, 65535
-    whole = tiff(pixels, 1, "<", False)
-    (tmp_path / "la.tiff").write_bytes(whole)
-    assert cv2.imread(str(tmp_path / "la.tiff"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+    """OpenCV halves its depth and drops its alpha. The file is written by the specification."""
+    tags = [
+        (256, 4, 1, 2), (257, 4, 1, 1), (258, 3, 2, 16 | 16 << 16), (262, 3, 1, 1), (273, 4, 1, 8),
+        (277, 3, 1, 2), (279, 4, 1, 8), (338, 3, 1, 2),
+    ]  # fmt: skip
+    fields = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    head = struct.pack("<2sHI8xH", b"II", 42, 16, len(tags))
+    path = tmp_path / "la.tiff"
+    path.write_bytes(head + fields + bytes(4))
+    assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).dtype == np.uint8
     with pytest.raises(FileFormatError, match="grey of 16 bits with alpha"):
-        read_image(tmp_path / "la.tiff")
-    # Text in place of the bits of each channel is damage.
-    text = struct.pack("<HHII", 258, 2, 2, 16 | 16 << 16)
-    damaged = whole.replace(struct.pack("<HHII", 258, 3, 2, 16 | 16 << 16), text)
-    assert damaged != whole
-    (tmp_path / "la.tiff").write_bytes(damaged)
-    with pytest.raises(FileFormatError, match="damaged|cannot be read"):
-        read_image(tmp_path / "la.tiff")
+        read_image(path)
