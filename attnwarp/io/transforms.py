@@ -12,8 +12,6 @@ import functools
 import json
 import math
 import os
-import warnings
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,7 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.errors import InputWarning, suggest
+from attnwarp.errors import suggest
 from attnwarp.io.dataset import (
     OF_IMAGES,
     Dataset,
@@ -34,7 +32,7 @@ from attnwarp.io.dataset import (
     with_images,
 )
 from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
-from attnwarp.io.find import FileFinder, name_key
+from attnwarp.io.find import FileFinder
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size
 from attnwarp.io.lens import Lens
 from attnwarp.io.ply import read_points, write_points
@@ -59,9 +57,6 @@ PINHOLE_MODELS = (
 )
 """Values of ``camera_model`` that mean a pinhole if all distortion coefficients are zero."""
 
-INTRINSICS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "w", "h")
-"""Keys allowed both in a frame and at the top of the file."""
-
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 CHANGES_THE_PICTURE = {
@@ -80,23 +75,6 @@ CHANGES_THE_PICTURE = {
     "sharpen": "sharpened pictures",
 }
 """Unsupported keys that change a picture's content, and their effect; refused if set."""
-
-UNUSED = {
-    "aabb_scale", "scale", "offset", "up", "n_frames", "from_na", "render_aabb", "sharpness",
-    "rotation", "colmap_im_id", "colmap_image_id", "depth_file_path", "depth_path", "normal_path",
-    "integer_depth_scale", "enable_depth_loading", "enable_ray_loading", "importance_sampling",
-    "orientation_override", "auto_scale_poses_override", "applied_scale", "time", "timestamp",
-    "driver_parameters", "n_extra_learnable_dims", "ftheta_p1", "ftheta_p2", "ftheta_p3",
-    "ftheta_p4", "ftheta_cx", "ftheta_cy",
-}  # fmt: skip
-"""Keys without effect on pictures: other programs' hints, and their scene normalisation."""
-
-USED = {
-    "camera_model", "is_fisheye", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
-    "w", "h", "file_path", "mask_path", "transform_matrix", "frames", "ply_file_path",
-    "applied_transform", "distortion_params", *DISTORTION,
-    *(f"{split}_filenames" for split in SPLITS),
-}  # fmt: skip
 
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
 
@@ -133,10 +111,6 @@ def read_transforms(
         FileFormatError: invalid JSON, a missing or wrongly typed key, lens distortion, an
             unsupported key that changes the picture, a pose that is not rigid, missing images, or
             a split that names no frame; the message names the frame and the key.
-
-    Warns:
-        InputWarning: unknown keys; frames without a split; a frame whose intrinsics differ from
-            those at the top; an image named by several frames.
 
     Example:
         >>> import json
@@ -331,23 +305,17 @@ def _read_file(
         _check_keys(values, ignore_keys)
         lens = _lens(values)
         if lens is not None and distorted == "error":
-            raise values.refuse(*_distortion_message(values, lens))
+            raise values.refuse(
+                "camera_model" if lens.kind == "fisheye" else "k1, k2, p1, p2, ...",
+                f"got a lens ({lens.kind}, {lens.coefficients}), expected a pinhole; undistort the"
+                " images first (attnwarp undistort DATA OUT, or COLMAP's image_undistorter)",
+            )
         cameras.append(_camera(values, image))
         lenses.append(lens)
         names.append(name)
         masks.append(None if "mask_path" in ignore_keys else _mask(values, finder))
         # This camera has the full picture's size; with_images resizes it.
         paths.append(image if scale == 1 else finder.find(_scaled(path, name, scale)))
-    keys = {key for level in (data, *frames) for key in level}
-    unknown = sorted(keys - USED - UNUSED - CHANGES_THE_PICTURE.keys())
-    if unknown:
-        warnings.warn(
-            f"{path}: not used, as their meaning is not known: {', '.join(unknown)[:200]}",
-            InputWarning,
-            stacklevel=2,
-        )
-    _warn_of_own_intrinsics(path, data, frames)
-    _warn_of_doubles(path, names, paths)
     splits = _splits(path, data, names, paths, split, finder)
     cameras, available = with_images(
         path,
@@ -395,25 +363,13 @@ def brief(value: Any) -> str:
 
 
 def _read_json(path: Path) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        result = dict(pairs)
-        if len(result) < len(pairs):
-            names = [name for name, _ in pairs]
-            twice = next(name for name in names if names.count(name) > 1)
-            raise FileFormatError(path, "stands twice in one object; remove one", field=twice[:60])
-        return result
-
     try:
-        return json.loads(path.read_bytes(), object_pairs_hook=unique)
-    except FileFormatError:
-        raise
-    except UnicodeDecodeError:
-        raise FileFormatError(
-            path, "not JSON, and no text; name a transforms.json, its folder or a COLMAP folder"
-        ) from None
+        return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         first = str(error).splitlines()[0]
-        raise FileFormatError(path, f"not JSON: {first}; write the file again") from None
+        raise FileFormatError(
+            path, f"not JSON: {first}; name a transforms.json, its folder or a COLMAP folder"
+        ) from None
 
 
 def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
@@ -430,49 +386,6 @@ def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
         )
 
 
-def _warn_of_doubles(path: Path, names: Sequence[str], images: Sequence[Path]) -> None:
-    """Warn of images named by several frames, under any names or links."""
-    real = [os.path.realpath(image) for image in images]
-    counts = Counter(real)
-    doubles = [name for name, file in zip(names, real, strict=True) if counts[file] > 1]
-    if doubles:
-        warnings.warn(
-            f"{path}: {sum(count > 1 for count in counts.values())} of {len(counts)} images are"
-            f" named by several frames, such as {brief(doubles[0])}; leave one frame of each, or it"
-            " counts several times",
-            InputWarning,
-            stacklevel=3,
-        )
-
-
-def _warn_of_own_intrinsics(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Warn that frames override the top's intrinsics, since programs disagree on precedence."""
-    other = {
-        i: keys
-        for i, frame in enumerate(frames)
-        if (keys := [key for key in INTRINSICS if _replaces(frame, data, key)])
-    }
-    if other:
-        first, keys = next(iter(other.items()))
-        warnings.warn(
-            f"{path}: {len(other)} of {len(frames)} frames have intrinsics other than the top of"
-            f" the file (first: frames[{first}], {', '.join(keys)}); the frame's are used, while"
-            " nerfstudio uses those of the top",
-            InputWarning,
-            stacklevel=3,
-        )
-
-
-def _replaces(frame: dict[str, Any], data: dict[str, Any], key: str) -> bool:
-    """Return True if a frame's value of ``key`` overrides a different value."""
-    if key not in frame:
-        return False
-    if key in data:
-        return bool(frame[key] != data[key])
-    length = key.replace("camera_angle", "fl")
-    return length not in frame and length in data
-
-
 def _splits(
     path: Path,
     data: dict[str, Any],
@@ -483,67 +396,50 @@ def _splits(
 ) -> list[str | None]:
     """Determine the split of each frame: from the file's lists, else ``split``.
 
-    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix; a name
-    without a match is compared in other systems' spellings. A frame in both test and val belongs
-    to test.
+    Names are compared as paths, with or without the image's suffix. A frame in both test and val
+    belongs to test.
     """
     frames: dict[str, list[int]] = {}
-    loose: dict[str, list[int]] = {}
     for i, (name, image) in enumerate(zip(names, images, strict=True)):
         for key in {os.path.normpath(path.parent / name), os.path.normpath(image)}:
             frames.setdefault(key, []).append(i)
-            loose.setdefault(name_key(key), []).append(i)
-
-    def frames_of(name: str) -> list[int]:
-        keys = [os.path.normpath(each) for each in (path.parent / name, finder.find(name))]
-        plain = os.path.normpath(path.parent / name.replace("\\", "/"))
-        return frames.get(keys[0]) or frames.get(keys[1]) or loose.get(name_key(plain), [])
-
     result: list[str | None] = [split] * len(names)
-    lists = [each for each in SPLITS if f"{each}_filenames" in data]
-    for each in lists:
+    for each in SPLITS:
         key = f"{each}_filenames"
-        listed = data[key]
+        listed = data.get(key) or []
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise FileFormatError(path, "expected a list of paths", field=key)
-        members = [frames_of(name) for name in listed]
-        lost = [name for name, indices in zip(listed, members, strict=True) if not indices]
-        if lost:
-            raise FileFormatError(
-                path,
-                f"{len(lost)} of {len(listed)} names are those of no frame: "
-                f"{', '.join(map(brief, lost[:3]))}{suggest(lost[0], names)}; name frames by their"
-                f" file_path; where frames were removed, remove their names too, or all of {key}",
-                field=key,
-            )
-        for i in (i for indices in members for i in indices):
-            if each != "train" and result[i] == "train":
+        for name in listed:
+            ways = (os.path.normpath(way) for way in (path.parent / name, finder.find(name)))
+            members = next((frames[way] for way in ways if way in frames), [])
+            if not members:
                 raise FileFormatError(
-                    path, f"{brief(names[i])} is in train_filenames too; remove one", field=key
+                    path,
+                    f"{brief(name)} is the name of no frame{suggest(name, names)}; where frames"
+                    f" were removed, remove their names too, or all of {key}",
+                    field=key,
                 )
-            result[i] = each
-    without = [name for name, each in zip(names, result, strict=True) if each is None]
-    # Programs write empty lists for unsplit datasets.
-    if without and any(data[f"{each}_filenames"] for each in lists):
-        warnings.warn(
-            f"{path}: {len(without)} of {len(names)} frames are in no split and not used by a"
-            f" fit: {', '.join(map(brief, without[:3]))}",
-            InputWarning,
-            stacklevel=2,
-        )
+            for i in members:
+                if each != "train" and result[i] == "train":
+                    raise FileFormatError(
+                        path, f"{brief(names[i])} is in train_filenames too; remove one", field=key
+                    )
+                result[i] = each
     return result
 
 
-def number(value: Any) -> float | None:
-    """Convert a JSON number to float; None for anything else, including "1.0", true and non-finite
-    values.
+def number(value: Any) -> float:
+    """Convert a JSON value to float; NaN for anything that is no finite number.
+
+    Example:
+        >>> number(3), number("fast"), number(None)
+        (3.0, nan, nan)
     """
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
     try:
-        return float(value) if math.isfinite(value) else None
-    except OverflowError:  # an integer beyond 1.8e308
-        return None
+        result = float(value)
+    except (TypeError, ValueError, OverflowError):  # an integer beyond 1.8e308
+        return math.nan
+    return result if math.isfinite(result) else math.nan
 
 
 class _Values:
@@ -571,7 +467,7 @@ class _Values:
         if value is None:
             return None
         result = number(value)
-        if result is None:
+        if math.isnan(result):
             raise self.refuse(key, f"got {brief(value)}, expected a finite number")
         return result
 
@@ -589,13 +485,8 @@ def _lens(values: _Values) -> Lens | None:
             " undistort the images first",
         )
     fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
-    # A level without coefficients is ignored; two different sets cannot both be right.
-    given = [c for level in values.levels if (c := _coefficients(values, level)) is not None]
-    if len(given) == 2 and given[0] != given[1]:
-        raise values.refuse(
-            "k1", "lens distortion differs between the frame and the top of the file"
-        )
-    by_name = given[0] if given else dict.fromkeys(DISTORTION, 0.0)
+    given = (_coefficients(values, level) for level in values.levels)
+    by_name = next((c for c in given if c is not None), dict.fromkeys(DISTORTION, 0.0))
     if by_name["k4"] and not fisheye and model != "FULL_OPENCV":
         # Some programs use the coefficient in a polynomial, others in a denominator.
         raise values.refuse(
@@ -611,20 +502,6 @@ def _lens(values: _Values) -> Lens | None:
     return None if lens.is_pinhole else lens
 
 
-def _distortion_message(values: _Values, lens: Lens) -> tuple[str, str]:
-    """Name the faulty key and a remedy."""
-    remedy = (
-        "expected a pinhole; undistort the images first (attnwarp undistort DATA OUT, or COLMAP's"
-        " image_undistorter)"
-    )
-    if lens.kind == "fisheye":
-        key = "is_fisheye" if values.get("is_fisheye") else "camera_model"
-        return key, f"got {brief(values.get(key))}, {remedy}"
-    key = next(key for key, c in zip(DISTORTION, lens.coefficients, strict=True) if c)
-    value = lens.coefficients[DISTORTION.index(key)]
-    return key, f"got lens distortion {value:g}, {remedy}"
-
-
 def _coefficients(values: _Values, level: dict[str, Any]) -> dict[str, float] | None:
     """Read the coefficients of one level by name; None without any."""
     own = {key: values.number(key, level) for key in DISTORTION}
@@ -634,15 +511,13 @@ def _coefficients(values: _Values, level: dict[str, Any]) -> dict[str, float] | 
             return None
         return {key: value or 0.0 for key, value in own.items()}
     coefficients = [number(v) for v in listed] if isinstance(listed, list) else []
-    if len(coefficients) != len(DISTORTION_LIST) or None in coefficients:
+    if len(coefficients) != len(DISTORTION_LIST) or any(map(math.isnan, coefficients)):
         raise values.refuse(
             "distortion_params",
             f"got {brief(listed)}, expected six numbers: {' '.join(DISTORTION_LIST)}",
         )
     result = dict.fromkeys(DISTORTION, 0.0)
-    result.update(
-        {key: value or 0.0 for key, value in zip(DISTORTION_LIST, coefficients, strict=True)}
-    )
+    result.update(zip(DISTORTION_LIST, coefficients, strict=True))
     for key, value in own.items():
         if value is not None and value != result[key]:
             raise values.refuse(key, "differs from distortion_params; remove one of them")
@@ -706,23 +581,14 @@ def _camera(values: _Values, image: Path) -> Camera:
 
 def _matrix(path: Path, key: str, row: int | None, value: Any) -> Array:
     """Parse a finite (4, 4) or (3, 4) matrix; a last row must be [0, 0, 0, 1]."""
-    rows = value if isinstance(value, list) else []
-    if len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise FileFormatError(
-            path, f"got {brief(value)}, expected 4 x 4 or 3 x 4 numbers", field=key, row=row
+            path, f"got {brief(value)}, expected 4 x 4 or 3 x 4 finite numbers", field=key, row=row
         )
-    # Strings and booleans, which numpy would convert, are refused.
-    entries = [number(entry) for entries in rows for entry in entries]
-    if None in entries:
-        wrong = [entry for entries in rows for entry in entries][entries.index(None)]
-        raise FileFormatError(
-            path,
-            f"holds {brief(wrong)}, expected 4 x 4 finite numbers; correct it or leave the frame"
-            " out",
-            field=key,
-            row=row,
-        )
-    matrix = np.array(entries, dtype=np.float64).reshape(-1, 4)
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
         raise FileFormatError(
             path,

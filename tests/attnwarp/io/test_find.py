@@ -76,24 +76,6 @@ def test_frames_find_their_images(tmp_path, spell):
     assert not any(set("/\\") & set(stem) for stem in file_stems(data.cameras))
 
 
-@pytest.mark.parametrize("there", [True, False])
-@pytest.mark.parametrize("spell", SPELLINGS.values(), ids=SPELLINGS)
-def test_lists_of_splits_find_their_frames(tmp_path, spell, there):
-    if there:
-        write_images(tmp_path)
-    elif spell is SPELLINGS["no suffix"]:
-        pytest.skip("without a file nothing says which suffix is meant")
-    lists = {"train_filenames": [NAMES[0], NAMES[2]], "test_filenames": [NAMES[1]]}
-    for one, two in ((spell, str), (str, spell), (spell, SPELLINGS["upper"])):
-        path = transforms(
-            tmp_path,
-            [two(name) for name in NAMES],
-            **{key: [one(name) for name in names] for key, names in lists.items()},
-        )
-        data = read_transforms(path, missing_images="error" if there else "none")
-        assert data.splits == ["train", "test", "train"]
-
-
 @pytest.mark.parametrize("spell", ["windows", "upper", "all"])
 def test_smaller_copies_and_the_points_are_found_too(tmp_path, spell):
     write_images(tmp_path)
