@@ -203,27 +203,32 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
     assert len(calls) == 6 and not np.array_equal(coarse, first)
 
 
-def test_textures_that_the_last_scene_had_are_not_made_again_and_no_picture_shows_it(monkeypatch):
-    made = []
-    real = build._colors
-    monkeypatch.setattr(build, "_colors", lambda of, at: made.append(of.type) or real(of, at))
+def test_shapes_that_the_last_scene_had_are_not_made_again_and_no_picture_shows_it(monkeypatch):
+    made, baked, colors = [], [], build._colors
+    form = build._form
+    monkeypatch.setattr(build, "_form", lambda *a: made.append(a[1].name) or form(*a))
+    monkeypatch.setattr(build, "_colors", lambda of, at: baked.append(of.type) or colors(of, at))
     floor = FLOOR | {"texture": {"type": "checker", "colors": ["#204080", "#c0a060"], "size": 0.3}}
 
-    def picture(color):
+    def picture(color="#ff0000", size=0.5, shine=()):
         ball = {
             "name": "ball",
-            "shape": {"type": "sphere", "center": [0, 0, 1.0], "radius": 0.5},
+            "shape": {"type": "sphere", "center": [0, 0, 2.0], "radius": size},
             "texture": {"type": "stripes", "colors": [color, "#ffffff"], "size": 0.1},
-        }
+        } | dict(shine)
         scene = world([SUN, SKY], [floor, ball]).with_size(24, 24)
         return mitsuba.render_plan(scene, scene.source, plan(scene, 2), 0)
 
+    rough = {"material": {"type": "plastic"}}
+    # A larger ball moves the middle of the scene, about which every shape is loaded.
+    cases = [{}, {"shine": rough}, {"color": "#0000ff"}, {"size": 0.8}]
     mitsuba.forget()
-    red, blue = picture("#ff0000"), picture("#0000ff")
-    assert made.count("checker") == 1 and made.count("stripes") == 2
-    mitsuba.forget()
-    assert np.array_equal(picture("#0000ff"), blue) and not np.array_equal(red, blue)
-    assert made.count("checker") == 2
+    pictures = [picture(**case) for case in cases]
+    assert made == ["floor", "ball", "ball", "ball", "floor", "ball"]
+    assert baked == ["checker", "stripes", "stripes", "stripes"]
+    for case, kept in zip(cases, pictures, strict=True):
+        mitsuba.forget()
+        assert np.array_equal(picture(**case), kept)
 
 
 def test_the_plan_follows_from_the_scene_and_says_why():

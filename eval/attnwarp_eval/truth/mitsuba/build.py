@@ -6,6 +6,7 @@ import contextlib
 import functools
 import hashlib
 import math
+import pickle
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -151,11 +152,9 @@ def load_world(
         center = _middle(scene.shapes())
         with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
             named = zip(_shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True)
+            made = [(name, make(), owner) for (name, _, make), owner in named]
             return assembled(
-                {
-                    name: (form, owner, functools.partial(dict, form))
-                    for (name, form), owner in named
-                },
+                {name: (form, owner, functools.partial(dict, form)) for name, form, owner in made},
                 center,
             )
 
@@ -282,6 +281,7 @@ def forget() -> None:
     Dr.Jit keeps every freed array for the next array of its size, and pictures differ in size.
     """
     _loaded.clear()
+    _kept.clear()
     _baked.clear()
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
@@ -295,14 +295,16 @@ def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, lis
     """Shapes that neither shine nor hold a medium, by name; origin; plugins."""
     mi = library()
     center = _middle(scene.shapes())
-    out: dict[str, Form] = {}
-    plugins: list[tuple[str, str]] = []
+    kept: dict[Any, tuple[Form, list[tuple[str, str]]]] = {}
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
-        for (name, form), owner in zip(
+        for (name, content, make), owner in zip(
             _shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True
         ):
-            shape = mi.load_dict(form, optimize=False)
-            plugins += plugin_names(name, form)
+            key = (mi.variant(), name, content)
+            if key in _kept:
+                kept[key] = _kept[key]
+                continue
+            form = make()
             item = scene.spec.objects[owner]
             again: Callable[[], dict[str, Any]] = dict
             if item.emission or isinstance(item.material, GlassMaterial):
@@ -311,8 +313,16 @@ def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, lis
                 # The file is deleted before a lamp or a filled glass is built from it.
                 data = Path(form["filename"]).read_bytes()
                 again = functools.partial(_from_memory, dict(form), data)
-            out[name] = (shape, owner, again)
-    return out, center, plugins
+            shape = mi.load_dict(form, optimize=False)
+            kept[key] = (shape, owner, again), plugin_names(name, form)
+    _kept.clear()
+    _kept.update(kept)
+    out = {name: form for (_, name, _), (form, _) in kept.items()}
+    return out, center, [each for _, plugins in kept.values() for each in plugins]
+
+
+_kept: dict[Any, tuple[Form, list[tuple[str, str]]]] = {}
+"""Shapes of the last scene, with their plugins: its edits and their answers share nearly all."""
 
 
 def _middle(shapes: Sequence[Shape]) -> Array:
@@ -336,35 +346,61 @@ def _owners(scene: Scene) -> list[int]:
 
 def _shapes(
     scene: Scene, center: Array, texel: float, folder: Path
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    mi = library()
+) -> Iterator[tuple[str, bytes, Callable[[], dict[str, Any]]]]:
+    """Name, hash and maker of each shape's Mitsuba dictionary; equal hashes, equal shapes."""
     baked: dict[Any, npt.NDArray[np.float32]] = {}
     warn_of_strays(scene, scene.shapes())
     for index, shape in enumerate(_faces(scene)):
         item = scene.spec.objects[shape.object_id]
-        texture = item.texture
+        if isinstance(item.shape, MeshSpec) and isinstance(shape, Mesh):
+            warn_of_lost_texture(item, shape)
+        place = hashlib.sha256(pickle.dumps((shape, texel, TEXELS))).digest()
+        texels = (item.texture.model_dump_json(), place)
+        if texels in _baked:
+            baked[texels] = _baked[texels]
+        content = hashlib.sha256(place + center.tobytes() + item.model_dump_json().encode())
+        file = folder / f"{index}.ply"
+        make = functools.partial(_form, shape, item, center, texel, file, baked, texels)
+        yield f"shape_{index:06d}", content.digest(), make
+    _baked.clear()
+    _baked.update(baked)
 
-        def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
-            if isinstance(texture, Plain) and not texture.variation:
-                color = np.empty(points.shape, dtype=np.float32)
-                color[:] = albedo(texture, points[0, :1])  # one colour for millions of texels
-            else:
-                places = hashlib.sha256(points.data).digest()
-                key = (texture.model_dump_json(), points.shape, places)
-                color = baked[key] = _baked[key] if key in _baked else _colors(texture, points)
-            bitmap = mi.Bitmap(color)
-            return {
-                "type": "bitmap",
-                "bitmap": bitmap,
-                "raw": True,
-                "filter_type": "bilinear",
-                "wrap_mode": "clamp",
-            }
 
-        reflectance: dict[str, Any]
-        if isinstance(shape, Sphere):
-            columns = _texels(2 * math.pi * shape.radius, texel)
-            rows = max(2, columns // 2)
+def _form(
+    shape: Sphere | Rectangle | Mesh,
+    item: ObjectSpec,
+    center: Array,
+    texel: float,
+    file: Path,
+    baked: dict[Any, npt.NDArray[np.float32]],
+    key: Any,
+) -> dict[str, Any]:
+    """Mitsuba dictionary of a shape; its texels are kept under ``key`` in ``baked``."""
+    mi = library()
+    texture = item.texture
+
+    def bake(size: tuple[int, int], points: Callable[[], Array]) -> dict[str, Any]:
+        if isinstance(texture, Plain) and not texture.variation:
+            color = np.empty((*size, 3), dtype=np.float32)
+            color[:] = albedo(texture, np.zeros((1, 3)))  # one colour for millions of texels
+        else:
+            if key not in baked:
+                baked[key] = _colors(texture, points())
+            color = baked[key]
+        return {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(color),
+            "raw": True,
+            "filter_type": "bilinear",
+            "wrap_mode": "clamp",
+        }
+
+    reflectance: dict[str, Any]
+    if isinstance(shape, Sphere):
+        columns = _texels(2 * math.pi * shape.radius, texel)
+        rows = max(2, columns // 2)
+
+        def on_sphere() -> Array:
             # Mitsuba's u is the longitude from +x, v the angle from +z; a bitmap in memory starts
             # at v = 0.
             phi = (np.arange(columns) + 0.5) / columns * 2 * np.pi
@@ -373,38 +409,39 @@ def _shapes(
                 [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi],
                 axis=-1,
             )
-            reflectance = bake(shape.center + shape.radius * outward) | {"wrap_mode": "repeat"}
-            form: dict[str, Any] = {
-                "type": "sphere",
-                "center": (shape.center - center).tolist(),
-                "radius": shape.radius,
-            }
-        elif isinstance(shape, Rectangle):
-            columns, rows = (
-                _texels(2 * float(np.linalg.norm(edge)), texel) for edge in (shape.u, shape.v)
-            )
+            return shape.center + shape.radius * outward
+
+        reflectance = bake((rows, columns), on_sphere) | {"wrap_mode": "repeat"}
+        form: dict[str, Any] = {
+            "type": "sphere",
+            "center": (shape.center - center).tolist(),
+            "radius": shape.radius,
+        }
+    elif isinstance(shape, Rectangle):
+        columns, rows = (
+            _texels(2 * float(np.linalg.norm(edge)), texel) for edge in (shape.u, shape.v)
+        )
+
+        def on_rectangle() -> Array:
             a = ((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :, None]
             b = ((np.arange(rows) + 0.5) / rows * 2 - 1)[:, None, None]
-            reflectance = bake(shape.center + a * shape.u + b * shape.v)
-            pose = np.eye(4)
-            pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = (
-                shape.u,
-                shape.v,
-                shape.normal,
-                shape.center - center,
-            )
-            form = {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose)}
-        else:
-            file = folder / f"{index}.ply"
-            if isinstance(item.shape, MeshSpec):
-                warn_of_lost_texture(item, shape)
-            color = albedo(texture, shape.vertices) * (1.0 if shape.tint is None else shape.tint)
-            _write_ply(file, shape, center, color)
-            form = {"type": "ply", "filename": str(file), "face_normals": shape.normals is None}
-            reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
-        yield f"shape_{index:06d}", form | {"bsdf": _bsdf(item, reflectance)}
-    _baked.clear()
-    _baked.update(baked)
+            return shape.center + a * shape.u + b * shape.v
+
+        reflectance = bake((rows, columns), on_rectangle)
+        pose = np.eye(4)
+        pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = (
+            shape.u,
+            shape.v,
+            shape.normal,
+            shape.center - center,
+        )
+        form = {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose)}
+    else:
+        color = albedo(texture, shape.vertices) * (1.0 if shape.tint is None else shape.tint)
+        _write_ply(file, shape, center, color)
+        form = {"type": "ply", "filename": str(file), "face_normals": shape.normals is None}
+        reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
+    return form | {"bsdf": _bsdf(item, reflectance)}
 
 
 _baked: dict[Any, npt.NDArray[np.float32]] = {}
