@@ -264,9 +264,7 @@ def calibrate(
 
 @app.command()
 def effects(
-    scene: Annotated[
-        str | None, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")
-    ] = None,
+    scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
     as_json: Annotated[
         bool,
         option(
@@ -281,38 +279,19 @@ def effects(
         float | None,
         option("End a proof's rendering after so many seconds (default 60).", "SECONDS", min=1),
     ] = None,
-    every: Annotated[
-        bool,
-        option(
-            "Write a table and pictures of every scene; started again, it goes on.", None, "--all"
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        option("Write the files of --all to this folder (default runs/effects).", "FOLDER"),
-    ] = None,
 ) -> None:
     """Show which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
 
-    if every == (scene is not None):
-        raise fail("name one scene, or say --all for a table of all of them")
     if budget is not None and not prove:
         raise fail("--budget: needs --prove, whose seconds it limits")
-    if out is not None and not every:
-        raise fail("--out: is the folder of --all; without it the answer is printed")
     seconds = 60.0 if budget is None else budget
-    if every:
-        if as_json:
-            raise fail("--json is of one scene; --all writes effects.json into --out")
-        _effects_of_all(out or Path("runs/effects"), prove, seconds)
-        return
     with clear_errors():
         from attnwarp_eval.effects import detect, proof
         from attnwarp_eval.effects.saving import measure
         from attnwarp_eval.scene.file import load_scene
 
-        loaded = load_scene(str(scene))
+        loaded = load_scene(scene)
         about = detect.report(loaded, cost=measure(loaded))
         result = proof.prove(loaded, seconds=seconds) if prove else None
     if result is not None:
@@ -323,26 +302,6 @@ def effects(
     typer.echo("\n".join(lines))
     if result is not None and result.verdict != "certified":
         raise fail(f"{loaded.name}: the plan is not certified: {result.words}", TOO_LITTLE)
-
-
-def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
-    with clear_errors():
-        from attnwarp_eval.effects.table import Settings, proof_words
-        from attnwarp_eval.experiments.effects import collect
-        from attnwarp_eval.scene.file import list_scenes
-
-        scenes = list_scenes()
-        with (
-            reporter(every=True) as report,
-            resumable(lambda: "finished scenes are kept"),
-        ):
-            entries = collect(scenes, out, Settings(prove=prove, budget=budget), report)
-    for name in ("effects.md", "effects.html"):
-        typer.echo(out / name)
-    doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
-                and e["proof"]["verdict"] != "certified"]  # fmt: skip
-    if doubtful:
-        raise fail(f"not every plan is certified: {'; '.join(doubtful)}", TOO_LITTLE)
 
 
 @app.command()

@@ -1,1 +1,1 @@
-"""Experiments about the instrument itself: what truth costs, and what effects of light change."""
+"""Experiments about the instrument itself: what truth costs."""

@@ -14,7 +14,6 @@ from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
 from attnwarp.warp.settings import PRESETS, preset
 from attnwarp.warp.view import Surface, warp_surfaces
 from attnwarp_eval import metrics
-from attnwarp_eval.effects.table import plan_words
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
@@ -25,7 +24,6 @@ from attnwarp_eval.study.study import parse_study
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.truth.features import SolidField
-from attnwarp_eval.truth.plan import plan
 
 SIZE = 128
 EXACT = preset("corrected", depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)
@@ -185,7 +183,8 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
     assert scene == "fog" and "shadows" in needed and "medium" in needed and missing == "–"
     assert planned == full == "volpath"
     assert "Mitsuba's `scalar_rgb`" in section.text[-1]
-    assert plan_words(plan(load_scene("lens")).to_dict()) == "path, thin lens"
+    (section,) = sections(lens=Extra(transport_of(load_scene("lens"))).to_json())
+    assert section.tables[0].rows[0][3] == "path, thin lens"
 
 
 def test_a_record_names_the_variant_that_drew_its_pictures(tmp_path):

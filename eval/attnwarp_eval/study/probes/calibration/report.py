@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.effects.table import plan_words
 from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -129,7 +128,7 @@ class CalibrationReport(ProbeReport):
             light = (
                 ", ".join(transport.needed) or "–",
                 ", ".join(transport.not_simulated) or "–",
-                plan_words(transport.plan),
+                _words(transport.plan),
                 transport.everything_on,
             )
             alike.setdefault(light, []).append(cell.scene)
@@ -171,4 +170,11 @@ def _worst(record: Record[Any], metric: str, pick: Callable[[list[float]], float
     )
     return (number(pick(values)) if values else "–") + (
         f" ({undefined} undefined)" if undefined else ""
+    )
+
+
+def _words(planned: Mapping[str, Any]) -> str:
+    """A plan in a few words: integrator, and the camera unless it is a pinhole."""
+    return str(planned["integrator"]) + (
+        ", thin lens" if planned["sensor"]["type"] == "thinlens" else ""
     )
