@@ -674,10 +674,10 @@ def _rows(
         done.rows.append(Row(figure.key, figure.title, similarity.mean, values, figure.encoder))
 
 
-def of_views(values: Mapping[str, float], over: Callable[..., Any] = np.mean) -> float:
-    """The mean, or another figure, of the defined values; NaN without one."""
+def of_views(values: Mapping[str, float]) -> float:
+    """The mean of the defined values; NaN without one."""
     defined = [value for value in values.values() if not np.isnan(value)]
-    return float(over(defined)) if defined else float("nan")
+    return float(np.mean(defined)) if defined else float("nan")
 
 
 def _function(figure: Figure) -> Callable[..., float]:
