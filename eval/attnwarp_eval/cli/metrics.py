@@ -92,14 +92,6 @@ def metrics(
             "FOLDER",
         ),
     ] = None,
-    scores: Annotated[
-        Path | None,
-        option(
-            "Show the scores of neighbours by a network of yours beside the others: a CSV with"
-            " the columns first, second and others such as 'MEt3R lower'.",
-            "FILE",
-        ),
-    ] = None,
     colmap: Annotated[
         bool,
         option(
@@ -137,7 +129,7 @@ def metrics(
 
         inputs = measure.Inputs(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, consistency, ply,
-            _color(background), colmap, depth, scores,
+            _color(background), colmap, depth,
         )  # fmt: skip
         one_view = {
             "--edited": edited, "--source-edit": source_edit, "--prompt": prompt,
@@ -149,7 +141,7 @@ def metrics(
                 f"{unread[0]}: figures of single views do not go with --consistency; leave it out"
                 " here, or --consistency"
             )
-        posed = {"--ply": ply, "--depth": depth, "--scores": scores, "--colmap": colmap or None}
+        posed = {"--ply": ply, "--depth": depth, "--colmap": colmap or None}
         for option, value in posed.items():
             if consistency is None and value is not None:
                 raise InputError(f"{option}: needs --consistency DATA, cameras with pictures")

@@ -182,8 +182,6 @@ _SPECS = (
     Metric("consistency.colmap_track_length", "views", "higher", 1e-2, 5e-2, "views that see a point, mean"),
     Metric("consistency.colmap_error", "px", "lower", 1e-3, 5e-2, "mean reprojection error of its points"),
     Metric("consistency.colmap_failed", "share", "lower", 1e-4, 0, "sets of views of which it makes no model"),
-    Metric("consistency.score_higher", "own", "higher", 0, 1e-3, "score of a pair from a file of scores, better if higher"),
-    Metric("consistency.score_lower", "own", "lower", 0, 1e-3, "score of a pair from a file of scores, better if lower"),
     Metric("consistency.edit_delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two views at known correspondences that the edit adds, changed pixels"),
     Metric("consistency.edit_delta_e_p90", "dE00", "lower", 1e-2, 1e-2, "90th percentile of it"),
     Metric("consistency.edit_pixels", "pixels", "none", 0, 0, "changed pixels that were compared"),

@@ -26,7 +26,6 @@ from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.metrics.known_geometry import GRID
-from attnwarp_eval.metrics.score_table import read_scores
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -156,17 +155,7 @@ def measure_consistency(
         (found,) = results(store, [_reconstruction(pairs, names)], 1, report)
         every = f"all {len(names)}"
         done.rows += [Row(f.key, f.title, found[f.key], {every: found[f.key]}) for f in together]
-    if inputs.scores is not None:
-        done.rows += _scores(inputs.scores, list(itertools.pairwise(names)))
     return done
-
-
-def _scores(path: Path, pairs: Sequence[tuple[str, str]]) -> list[Row]:
-    rows = []
-    for key, of_pair in read_scores(path, ("first", "second"), "--scores").items():
-        own = {f"{one} to {two}": of_pair.get((one, two), float("nan")) for one, two in pairs}
-        rows.append(Row(key, key.split(".", 2)[2], of_views(own), own))
-    return rows
 
 
 def _not_installed(figure: Figure) -> str:

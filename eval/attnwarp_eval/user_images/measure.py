@@ -65,7 +65,7 @@ class Inputs:
             distance, black and transparent do not.
         poses, ply: cameras with pictures, and splats of the scene before the edit, for
             :func:`attnwarp_eval.user_images.consistency.measure_consistency`.
-        depth: folder of depth maps, for it; scores: its file of scores.
+        depth: folder of depth maps, for it.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
     """
 
@@ -81,7 +81,6 @@ class Inputs:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     colmap: bool = False
     depth: Path | None = None
-    scores: Path | None = None
 
 
 @dataclass(frozen=True)

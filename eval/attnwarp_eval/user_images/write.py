@@ -34,7 +34,6 @@ _INPUTS = (
     "poses",
     "ply",
     "depth",
-    "scores",
 )
 
 _READING = (

@@ -96,25 +96,19 @@ def test_every_figure_is_that_of_its_function(capture, tmp_path):
     )
 
 
-def test_depth_from_a_folder_stands_for_rendered_depth_and_scores_are_read(capture, tmp_path):
+def test_depth_from_a_folder_stands_for_rendered_depth(capture, tmp_path):
     dataset = read_dataset(capture)
-    folder, scores = tmp_path / "depth", tmp_path / "scores.csv"
+    folder = tmp_path / "depth"
     folder.mkdir()
     for camera, path in zip(dataset.cameras, dataset.image_paths, strict=True):
         surface = render_surface(few_splats(), camera)
         np.save(folder / f"{path.stem}.npy", surface.depth.numpy())
-    scores.write_text("first,second,MEt3R lower\n0,1,0.25\n1,2,\n2,3,0.75\n")
     off = ("--dino=none", "--clip=none", "--perceptual=none")
-    given, _ = measured(capture, tmp_path / "a", "--depth", folder, "--scores", scores, *off)
+    given, _ = measured(capture, tmp_path / "a", "--depth", folder, *off)
     rendered, _ = measured(capture, tmp_path / "b", "--ply", capture / "scene.ply", *off)
     key = "consistency.rendered_mae_srgb"
     own, other = (data["metrics"][key]["value"] for data in (given, rendered))
     assert own == pytest.approx(other, abs=0.01)  # without the test of normals
-    row = given["metrics"]["consistency.score_lower.MEt3R"]
-    assert (row["value"], row["direction"]) == (0.5, "lower")
-    scores.write_text("first,second,MEt3R\n0,1,0.25\n")
-    done = call("--consistency", capture, "--scores", scores, "--out", tmp_path / "c", *off)
-    assert done.exit_code == 2 and "scores such as 'MEt3R lower'" in done.output
 
 
 def test_a_repainted_view_is_seen_and_a_second_call_computes_nothing(capture, tmp_path):
