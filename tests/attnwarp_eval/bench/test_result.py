@@ -148,17 +148,8 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
         (["gaussctrl"], "made for a depth"),
         (["by_view", "--set", "foo=1"], "one of"),
     ):
-        call = [
-            "bench",
-            "run",
-            str(bench),
-            str(tmp_path / "no"),
-            "--editor",
-            "small-plain",
-            "--method",
-            *wrong,
-        ]
-        done = CliRunner().invoke(app, call)
+        call = ["bench", "run", str(bench), str(tmp_path / "no"), "--editor", "small-plain"]
+        done = CliRunner().invoke(app, [*call, "--method", *wrong])
         assert done.exit_code == 2 and said in done.stderr
     with alone_in(out):  # another process runs there
         done = CliRunner().invoke(app, ["bench", "run", str(bench), str(out), "--method", "warp"])

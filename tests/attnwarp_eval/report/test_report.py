@@ -123,6 +123,8 @@ def drawn(table, seeds=(0,), **changes):
     return written_runs.results(content, cells)
 
 
+CLEARLY = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
+
 UNSURE = np.exp([0.5, -0.2, 0.6, 0.1, -0.3, 0.4, 0.2, -0.1])
 """Factors between two sides that eight scenes cannot tell from 1."""
 
@@ -247,12 +249,11 @@ def test_differences_that_vanish_in_every_view_are_called_the_same_values_and_ne
 
 
 def test_only_its_own_study_judges_a_claim_and_the_expected_direction_holds():
-    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
-    (told,) = judge(drawn(clear), [SLIP_CLAIM])
+    (told,) = judge(drawn(CLEARLY), [SLIP_CLAIM])
     assert (outcome(told), told.p, told.metric) == ("holds", 2 / 2**8, SLIP)
     assert (told.a, told.b) == ("good", "slipped")
-    assert judge(drawn(clear, name="other"), [SLIP_CLAIM]) == []
-    (opposite,) = judge(drawn(clear), [dataclasses.replace(SLIP_CLAIM, expect="lower")])
+    assert judge(drawn(CLEARLY, name="other"), [SLIP_CLAIM]) == []
+    (opposite,) = judge(drawn(CLEARLY), [dataclasses.replace(SLIP_CLAIM, expect="lower")])
     assert outcome(opposite) == "the opposite holds"
 
 
@@ -273,8 +274,7 @@ PLAN = {"drawn": 8, "seed": 7, "size": 512}
 def test_a_claim_on_less_than_was_planned_is_not_finished_and_adjusts_no_other(
     plan, changes, undone
 ):
-    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
-    whole = drawn(clear)
+    whole = drawn(CLEARLY)
     claim = dataclasses.replace(SLIP_CLAIM, scenes=PLAN)
     assert [outcome(one) for one in judge(whole, [claim])] == ["holds"]
     run = written_runs.results(study(**changes), whole.cells) if changes else whole
@@ -319,20 +319,26 @@ def test_only_a_difference_that_may_be_none_is_equal_and_a_sure_one_is_less_than
     assert finding.verdict == verdict
 
 
+WRONG = {"set": {"depth_agreement": False}}
+
+
+def judged_beside(control, table=CLEARLY, expected="worse", **changes):
+    """The claim's verdict beside a control of these figures; None where it was not measured."""
+    table = table if control is None else {**table, "wrong": [control]}
+    variants = {**study()["variants"], "wrong": WRONG}
+    run = drawn(table, variants=variants, probes={"warp": list(variants)})
+    claim = dataclasses.replace(SLIP_CLAIM, control={expected: WRONG}, **changes)
+    (finding,) = judge(run, [claim])
+    return finding
+
+
 @pytest.mark.parametrize(
     ("factor", "control", "verdict"),
     [(1.5, "seen", "holds"), (1.0, "not seen", "blind"), (0.5, "not seen", "blind"),
      (None, "not measured", "can't tell")],
 )  # fmt: skip
 def test_a_claim_whose_control_does_no_worse_than_its_last_side_is_blind(factor, control, verdict):
-    slipped = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]
-    table = {"good": [[0.1] * 8], "slipped": [slipped]}
-    if factor is not None:
-        table["wrong"] = [[factor * x for x in slipped]]
-    variants = {**study()["variants"], "wrong": {"set": {"depth_agreement": False}}}
-    run = drawn(table, variants=variants, probes={"warp": list(variants)})
-    claim = dataclasses.replace(SLIP_CLAIM, control={"worse": variants["wrong"]})
-    (finding,) = judge(run, [claim])
+    finding = judged_beside(factor and factor * np.array(CLEARLY["slipped"][0]))
     assert (finding.control.seen, outcome(finding)) == (control, verdict)
 
 
@@ -342,13 +348,8 @@ def test_a_control_that_reaches_more_than_half_of_a_gain_is_seen_and_the_claim_b
 ):
     """Oracle: from an error of 0.9 px to one of 0.3 px, of which the control has a part."""
     wiggle = 0.001 * np.arange(8)
-    table = {"good": [0.9 + wiggle], "slipped": [0.3 + wiggle], "wrong": [control + wiggle]}
-    variants = {**study()["variants"], "wrong": {"set": {"depth_agreement": False}}}
-    run = drawn(table, variants=variants, probes={"warp": list(variants)})
-    claim = dataclasses.replace(
-        SLIP_CLAIM, expect="lower", control={"worse": variants["wrong"]}, equal_within=None
-    )
-    (finding,) = judge(run, [claim])
+    table = {"good": [0.9 + wiggle], "slipped": [0.3 + wiggle]}
+    finding = judged_beside(control + wiggle, table, expect="lower")
     share = (0.9 - control) / (0.9 - 0.3)
     assert finding.control.share == pytest.approx([share] * 3)
     assert (finding.control.seen, outcome(finding)) == ("seen", verdict)
@@ -362,19 +363,14 @@ def test_a_control_that_reaches_more_than_half_of_a_gain_is_seen_and_the_claim_b
 def test_wrong_features_that_do_as_well_explain_no_loss(expected, verdict):
     """True pictures that do no better do: the figure cannot tell good from bad."""
     table = {"good": [[0.5 + 0.01 * k for k in range(8)]], "slipped": [[0.1] * 8]}
-    table["wrong"] = [[0.1] * 8]
-    variants = {**study()["variants"], "wrong": {"set": {"depth_agreement": False}}}
-    run = drawn(table, variants=variants, probes={"warp": list(variants)})
-    claim = dataclasses.replace(SLIP_CLAIM, control={expected: variants["wrong"]})
-    (finding,) = judge(run, [claim])
+    finding = judged_beside([0.1] * 8, table, expected)
     assert (finding.control.seen, outcome(finding)) == ("not seen", verdict)
 
 
 def test_p_values_are_adjusted_over_the_claims_of_all_studies():
     """Oracle: Benjamini and Hochberg by hand: 4 / 256 of one, and 2 / 256 of another, of two."""
-    clear = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]
-    nearly = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.09]
-    runs = [drawn({"good": [[0.1] * 8], "slipped": [row]}) for row in (clear, nearly)]
+    (clear,) = CLEARLY["slipped"]
+    runs = [drawn(CLEARLY | {"slipped": [row]}) for row in (clear, [*clear[:-1], 0.09])]
     both = [one for run in runs for one in measured(run, [SLIP_CLAIM])]
     assert [one.contrast.flips.p for one in both] == [2 / 256, 4 / 256]
     assert [one.p for one in judged(both)] == [4 / 256, 4 / 256]
@@ -435,9 +431,6 @@ def test_more_scenes_are_needed_where_more_claims_are_told_apart():
     count = needed(adjusted)
     effect = np.log(UNSURE).mean() / np.log(UNSURE).std(ddof=1)
     assert power(count, effect, level) >= 0.8 > power(count - 1, effect, level)
-
-
-METHODS = {"alone": {"options": {"a0": 0.0}}, "mine": {"options": {"iterations": 5}}}
 
 
 def edited(
@@ -601,9 +594,8 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
 
 
 def test_a_study_that_judges_claims_begins_with_their_verdicts():
-    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
     claims = [SLIP_CLAIM, dataclasses.replace(SLIP_CLAIM, text="It does not", expect="lower")]
-    run = drawn(clear, title="What slips")
+    run = drawn(CLEARLY, title="What slips")
     section = claims_section(run, judge(run, claims))
     assert section.text[0] == (
         "2 claims are judged. As expected: 1. The opposite of what was expected: 1."

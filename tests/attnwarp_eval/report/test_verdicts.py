@@ -98,13 +98,6 @@ def defined(value):
     return np.nan if value is None else value
 
 
-def test_a_run_is_compared_with_the_raw_results_of_a_report(reported):
-    store, raw = reported
-    done = invoke("compare", raw, store.root)
-    assert done.exit_code == 0, done.output
-    assert done.stdout.startswith("pass: 0 worse, 0 can't tell, 0 better, ")
-
-
 def test_raw_results_outlive_the_keys_of_their_study(reported, tmp_path):
     path = reported[1] / "results.jsonl.xz"
     head, *cells = lzma.decompress(path.read_bytes()).decode().splitlines()
@@ -128,8 +121,8 @@ def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(re
             assert defined(one.pop(name)) == close
         assert one == other
     assert str(pathlib.Path.home()) not in lzma.decompress(path.read_bytes()).decode()
-    # The same run twice, and its own table of figures in the place of the folder.
-    for baseline in (path, store.root / "results.jsonl"):
+    # Raw results, their folder, and the run's own table of figures in the place of its folder.
+    for baseline in (path, raw, store.root / "results.jsonl"):
         same = invoke("compare", baseline, store.root)
         assert same.exit_code in (0, 3), same.output
         assert "0 worse, 0 can't tell, 0 better" in same.output
@@ -268,14 +261,6 @@ def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict
     assert [text for text, pair in pairs.items() if pair == opposite] == []
     agreeing = [text for text, pair in pairs.items() if len(pair & opposite) == len(pair) == 1]
     assert len(agreeing) > 3  # the halves do tell
-
-
-def test_raw_results_are_lines_of_json(reported):
-    text = lzma.decompress((reported[1] / "results.jsonl.xz").read_bytes()).decode()
-    head, *cells = map(json.loads, text.splitlines())
-    assert head["study"]["name"] == "stored" and len(cells) == 16
-    probes = {cell["record"]["spec"]["probe"] for cell in cells}
-    assert probes == {"calibration", "depth", "fit", "timing", "warp"}
 
 
 def test_of_200_simulated_runs_of_equal_arms_few_judge_and_no_interval_disagrees(

@@ -17,11 +17,24 @@ from attnwarp_eval.statistics.intervals import (
     verdict,
 )
 
+NAN = float("nan")
 
-def test_mean_is_over_scenes_so_a_scene_with_many_views_does_not_outvote_the_others():
-    result = interval({"many": [1.0] * 90, "few": [3.0] * 2})
-    assert result.mean == pytest.approx(2.0)
-    assert (result.scenes, result.views) == (2, 92)
+
+@pytest.mark.parametrize(
+    ("values", "mean", "scenes", "views", "undefined"),
+    [
+        ({"many": [1.0] * 90, "few": [3.0] * 2}, 2.0, 2, 92, 0),  # many views do not outvote
+        ({"a": [1.0, NAN], "b": [NAN, NAN], "c": [3.0, 3.0]}, 2.0, 2, 3, 3),
+        ({"a": [1.0, 2.0, 3.0]}, 2.0, 1, 3, 0),  # one scene has no interval
+        ({"a": [NAN]}, NAN, 0, 0, 1),  # and not zero
+    ],
+)
+def test_a_mean_is_over_scenes_and_counts_what_is_undefined(values, mean, scenes, views, undefined):
+    result = interval(values)
+    assert result.mean == pytest.approx(mean, nan_ok=True)
+    assert (result.scenes, result.views, result.undefined) == (scenes, views, undefined)
+    assert result.bounded == (scenes > 1)
+    assert result.bounded or verdict(result, "higher") == "can't tell"
 
 
 def test_the_interval_is_students_t_over_the_means_of_the_scenes():
@@ -52,26 +65,6 @@ def test_intervals_cover_the_true_mean_at_their_stated_rate(scenes, between, wit
         covered += result.low <= 0.0 <= result.high
     # Binomial(1000, 0.95) has a standard deviation of 0.7 %; four of them.
     assert covered / trials == pytest.approx(0.95, abs=0.028)
-
-
-def test_undefined_values_are_counted_and_never_averaged_in():
-    result = interval({"a": [1.0, np.nan], "b": [np.nan, np.nan], "c": [3.0, 3.0]})
-    assert result.mean == pytest.approx(2.0)
-    assert (result.scenes, result.views, result.undefined) == (2, 3, 3)
-
-
-def test_nothing_defined_is_nan_and_not_zero():
-    result = interval({"a": [np.nan]})
-    assert np.isnan(result.mean)
-    assert not result.bounded
-    assert result.undefined == 1
-
-
-def test_one_scene_has_a_mean_but_no_interval():
-    result = interval({"a": [1.0, 2.0, 3.0]})
-    assert result.mean == pytest.approx(2.0)
-    assert not result.bounded
-    assert verdict(result, "higher") == "can't tell"
 
 
 def test_a_paired_difference_cancels_what_the_views_share():
