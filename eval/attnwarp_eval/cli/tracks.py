@@ -42,10 +42,6 @@ def tracks(
             "FOLDER",
         ),
     ] = None,
-    truth: Annotated[
-        str | None,
-        option("Compare with the exact geometry of this scene, which DATA exports.", "SCENE"),
-    ] = None,
     out: Annotated[
         Path, option("Write tracks.json and tracks.html to this folder.", "FOLDER")
     ] = Path("runs/tracks"),
@@ -78,10 +74,8 @@ def tracks(
         views = load_views(dataset, max_size=max_size)
         page = written.Page(out, views, found.resized(dataset.cameras, views.cameras))
         for path in ply:
-            page.add(
-                path, read_splats(path, None, None), presets, apart or (1, 3, 6), truth, report
-            )
-        paths = page.write({"data": str(data), "ply": [str(path) for path in ply], "truth": truth})
+            page.add(path, read_splats(path, None, None), presets, apart or (1, 3, 6), report)
+        paths = page.write({"data": str(data), "ply": [str(path) for path in ply]})
     Console().print(terminal(written.short_table(page.rows)))
     for path in paths:
         typer.echo(path)

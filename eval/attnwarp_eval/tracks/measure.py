@@ -13,10 +13,9 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.reporting import SILENT, Reporter
-from attnwarp.warp import PRESETS, Surface, WarpedView, render_surface, warp_view
+from attnwarp.warp import PRESETS, Surface, render_surface, warp_view
 from attnwarp.warp.depth import blend_depth, valid_depth
 from attnwarp_eval.tracks.find import Array, Mask, Tracks, world_points
-from attnwarp_eval.truth import AMBIGUOUS, VISIBLE, Geometry, two_view
 
 OFF = 2.0
 """Error in px beyond which a position is wrong."""
@@ -25,25 +24,6 @@ LEAST = 5
 """Least common points of a pair."""
 
 RESAMPLES = 400
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Figures of a pair from exact geometry.
-
-    Attributes:
-        error: (n,) px of the warp at the tracks' points; NaN without a counterpart.
-        visible: (n,) bool: whether the source sees the point's surface.
-        errors: px of the warp at all target pixels visible in the source.
-        kept: share of those pixels that the mask keeps.
-        accepted: share of the hidden pixels that the mask keeps; NaN without any.
-    """
-
-    error: Array
-    visible: Mask
-    errors: Array
-    kept: float
-    accepted: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +40,6 @@ class Pair:
         kept: (n,) bool whether the mask keeps the point.
         floor: (n,) px between the track's 3D point and its observation, in the source.
         flat: (n,) px of a warp whose depth is the target's median everywhere.
-        truth: the same from exact geometry, if the scene has one.
     """
 
     source: int
@@ -72,7 +51,6 @@ class Pair:
     kept: Mask
     floor: Array
     flat: Array
-    truth: Truth | None = None
 
 
 def measure(
@@ -83,7 +61,6 @@ def measure(
     *,
     apart: Sequence[int] = (1, 3, 6),
     held_out: Sequence[bool] | None = None,
-    geometry: Geometry | None = None,
     near: float | None = None,
     report: Reporter = SILENT,
 ) -> list[Pair]:
@@ -99,7 +76,6 @@ def measure(
         preset: name of the warp's settings.
         apart: distances between the views of a pair, in the cameras' order.
         held_out: flag of each camera: held out of the fit.
-        geometry: exact geometry, for captures of a scene that has it.
         near: near plane in scene units, as in :func:`attnwarp.warp.render_surface`.
         report: callback for each finished pair.
 
@@ -145,7 +121,6 @@ def measure(
                 _holds(view.mask, at),
                 distance(where),
                 distance(target.unproject(at, np.full(len(at), flat))),
-                None if geometry is None else _truth(geometry, view, at, read.numpy()),
             )
         )  # fmt: skip
     report.step(len(wanted), len(wanted), preset)
@@ -164,29 +139,6 @@ def _holds(mask: torch.Tensor, xy: Array) -> Mask:
     x = np.clip(np.floor(xy[:, 0]).astype(int), 0, values.shape[1] - 1)
     y = np.clip(np.floor(xy[:, 1]).astype(int), 0, values.shape[0] - 1)
     return np.asarray(values[y, x], dtype=bool)
-
-
-def _truth(geometry: Geometry, view: WarpedView, at: Array, depth: Array) -> Truth:
-    source, target = view.correspondence.source, view.correspondence.target
-    hits = geometry.trace_rays(target.position, target.directions(at) @ target.rotation)
-    true, z = source.project(hits.point)
-    with np.errstate(invalid="ignore"):
-        inside = (true >= 0).all(axis=1) & (true < [source.width, source.height]).all(axis=1)
-    visible = inside & (z > 0)
-    visible[visible] = geometry.visible_from(
-        hits.point[visible], hits.normal[visible], hits.primitive_id[visible], source
-    )
-    exact = two_view(geometry, source, target)
-    sees, mask = exact.label == VISIBLE, view.mask.numpy()
-    hidden = exact.hits.valid & ~sees & (exact.label != AMBIGUOUS)
-    everywhere = np.linalg.norm(view.correspondence.xy.numpy() - exact.xy, axis=-1)
-    return Truth(
-        np.linalg.norm(source.project(target.unproject(at, depth))[0] - true, axis=1),
-        visible,
-        everywhere[sees],
-        float(mask[sees].mean()) if sees.any() else float("nan"),
-        float(mask[hidden].mean()) if hidden.any() else float("nan"),
-    )
 
 
 @dataclass(frozen=True)

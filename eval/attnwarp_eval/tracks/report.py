@@ -20,10 +20,8 @@ from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
-from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.tracks.find import Tracks
 from attnwarp_eval.tracks.measure import LEAST, OFF, Figure, Pair, measure, summarise
-from attnwarp_eval.truth import Geometry
 
 FORMAT = 1
 """Version of tracks.json."""
@@ -51,13 +49,6 @@ NAMES = {
 }  # fmt: skip
 """Columns of the :data:`attnwarp_eval.tracks.measure.FIGURES`."""
 
-EXACT = {
-    "median": "error, px", "off": "off", "dropped_off": "off, dropped",
-    "visible": "of points visible", "median_everywhere": "error of all visible pixels",
-    "kept_everywhere": "kept of all visible", "hidden_accepted": "hidden accepted",
-}  # fmt: skip
-"""Columns of :attr:`Row.truth`."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -70,7 +61,6 @@ class Row:
         pairs, points: numbers of pairs and points.
         angle: median degrees between the rays of a point.
         figures: see :data:`attnwarp_eval.tracks.measure.FIGURES`.
-        truth: figures from exact geometry; empty without it.
     """
 
     splats: str
@@ -81,7 +71,6 @@ class Row:
     points: int
     angle: float
     figures: dict[str, Figure]
-    truth: dict[str, float]
 
 
 def rows_of(splats: str, preset: str, pairs: Sequence[Pair]) -> list[Row]:
@@ -98,29 +87,10 @@ def rows_of(splats: str, preset: str, pairs: Sequence[Pair]) -> list[Row]:
                 rows.append(
                     Row(
                         splats, preset, apart, views, len(chosen), len(angle),
-                        float(np.median(angle)), summarise(chosen), _truth_of(chosen),
+                        float(np.median(angle)), summarise(chosen),
                     )
                 )  # fmt: skip
     return sorted(rows, key=lambda row: (row.views != "all", row.apart))
-
-
-def _truth_of(pairs: Sequence[Pair]) -> dict[str, float]:
-    known = [(pair, pair.truth) for pair in pairs if pair.truth is not None]
-    if not known:
-        return {}
-    errors = np.concatenate([truth.error for _, truth in known])
-    kept = np.concatenate([pair.kept for pair, _ in known])
-    visible = np.concatenate([truth.visible for _, truth in known])
-    off = visible & ~(errors <= OFF)
-    return {
-        "median": float(np.nanmedian(errors[visible])),
-        "off": float(off[visible].mean()),
-        "dropped_off": float(1 - kept[off].mean()) if off.any() else float("nan"),
-        "visible": float(visible.mean()),
-        "median_everywhere": float(np.nanmedian(np.concatenate([t.errors for _, t in known]))),
-        "kept_everywhere": float(np.nanmean([t.kept for _, t in known])),
-        "hidden_accepted": float(np.nanmean([t.accepted for _, t in known])),
-    }
 
 
 def table(rows: Iterable[Row]) -> Table:
@@ -166,7 +136,6 @@ class Page:
         splats: Gaussians,
         presets: Sequence[str],
         apart: Sequence[int],
-        truth: str | None = None,
         report: Reporter = SILENT,
     ) -> None:
         """Measure splats under each preset.
@@ -176,7 +145,6 @@ class Page:
                 held out of the fit.
             presets: names of the warp's settings.
             apart: distances between the views of a pair.
-            truth: name of the scene that the capture is an export of.
             report: receiver of progress.
 
         Raises:
@@ -188,11 +156,10 @@ class Page:
             (path.parent / "held_out" / f"{Path(camera.name).stem}.png").is_file()
             for camera in cameras
         ]
-        geometry = None if truth is None else Geometry(load_scene(truth))
         for name in presets:
             pairs = measure(
                 splats, cameras, self.tracks, name, apart=apart, held_out=held,
-                geometry=geometry, near=near_of(cameras, splats), report=report,
+                near=near_of(cameras, splats), report=report,
             )  # fmt: skip
             if not pairs:
                 raise InputError(
@@ -223,12 +190,4 @@ class Page:
 
     def _sections(self) -> Iterator[Section]:
         yield Section("Figures", tables=[table(self.rows)])
-        exact = [row for row in self.rows if row.truth]
-        if exact:
-            cells = [[*_first(row), *(_plain(row.truth[name]) for name in EXACT)] for row in exact]
-            yield Section(
-                "What exact geometry says",
-                ["The same points against exact geometry, then every pixel."],
-                [Table([*COLUMNS, *EXACT.values()], cells)],
-            )
         yield Section("How to read this", [READING, BLIND])
