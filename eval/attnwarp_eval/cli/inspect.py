@@ -85,7 +85,7 @@ def inspect(
     ] = None,
     export: Annotated[
         Path | None,
-        option("Write this file (.html, .glb, .vtp) in place of opening a window.", "FILE"),
+        option("Write this file (.html, .glb) in place of opening a window.", "FILE"),
     ] = None,
     web: Annotated[
         bool, option("Serve the window to a browser; Ctrl-C ends it.", None, "--web")

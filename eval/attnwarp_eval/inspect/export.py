@@ -1,4 +1,4 @@
-"""Export of the view to share: .glb for viewers, .vtp with every number, .html as a page."""
+"""Export of the view to share: .glb for viewers, .html as a page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from attnwarp_eval.inspect.subject import Subject
 if TYPE_CHECKING:
     import pyvista
 
-ENDINGS = (".html", ".glb", ".vtp")
+ENDINGS = (".html", ".glb")
 
 FLOAT, UINT32, UINT16 = 5126, 5125, 5123
 """glTF's numbers of the types."""
@@ -43,15 +43,15 @@ def check_ending(path: Path) -> None:
         InputError: another ending.
     """
     if path.suffix not in ENDINGS:
-        raise InputError(f"{path}: got {path.suffix or 'no ending'}, expected .html, .glb or .vtp")
+        raise InputError(f"{path}: got {path.suffix or 'no ending'}, expected .html or .glb")
 
 
 def write_export(path: Path, subject: Subject, state: State, picked: Any = None) -> None:
     """Write the scene of a state; only .html needs OpenGL.
 
     Args:
-        path: ends in .html (a page that needs no network), .glb (coloured surface, frusta with
-            their pictures, splats, rays) or .vtp (the surface with every number of its pixels).
+        path: ends in .html (a page that needs no network), or .glb (coloured surface, frusta with
+            their pictures, splats, rays).
         picked: the report of a picked pixel or cell, or None.
 
     Raises:
@@ -61,47 +61,12 @@ def write_export(path: Path, subject: Subject, state: State, picked: Any = None)
     check_ending(path)
     pair = subject.pair(state.variant, state.target)
     parts = scene.parts(subject, pair, state, picked)
-    if path.suffix == ".vtp":
-        data = vtp(pair, state)
-    elif path.suffix == ".glb":
+    if path.suffix == ".glb":
         data = glb(parts, subject.center, subject.up)
     else:
         title = scene.title(subject, pair, state)
         data = page(parts, subject, pair, title, pair.legend(state.coloring))
     write_atomically(path, lambda stream: stream.write(data))
-
-
-def vtp(pair: Pair, state: State) -> bytes:
-    """The target's visible surface as VTK's XML, with the numbers of each pixel."""
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    seen = pair.seen
-    mesh = scene.seen_surface(seen, pair.colors(state.coloring, state.layer, state.step or None))
-    pixel = mesh.point_data["pixel"]
-
-    def add(name: str, values: npt.NDArray[Any]) -> None:
-        mesh.point_data[name] = values.reshape(-1, *values.shape[2:])[pixel]
-
-    correspondence = pair.view.correspondence
-    add("source_xy", correspondence.xy.numpy())
-    add("source_z", correspondence.z.numpy())
-    add("source_depth", pair.source_depth)
-    add("tolerance", pair.tolerance)
-    add("accepted", pair.mask(state.layer).astype(np.uint8))
-    for rule, mask in pair.view.rules.items():
-        add(f"{rule}", mask.numpy().astype(np.uint8))
-        add(f"{rule}_margin", pair.margins[rule][0])
-    for name, depth in pair.depths.items():
-        add(f"depth {name}", depth)
-    if pair.truth is not None:
-        add("label", pair.truth.label)
-        add("exact_xy", pair.truth.xy)
-    writer = vtkXMLPolyDataWriter()
-    writer.SetInputData(mesh)
-    writer.WriteToOutputStringOn()
-    writer.Write()
-    text: str = writer.GetOutputString()
-    return text.encode()
 
 
 # --- glTF 2.0, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html

@@ -11,7 +11,7 @@ from attnwarp.errors import InputError
 OSMESA = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 """Names of the software renderer that VTK falls back to."""
 
-WITHOUT_DRAWING = "--export FILE.glb or FILE.vtp needs no OpenGL, --pixel prints the numbers"
+WITHOUT_DRAWING = "--export FILE.glb needs no OpenGL, --pixel prints the numbers"
 
 
 def has_display() -> bool:

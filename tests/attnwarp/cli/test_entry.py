@@ -91,7 +91,7 @@ def test_a_kill_that_an_import_turns_into_its_own_error_is_one_line(strict):
 @pytest.mark.parametrize(
     "command",
     [
-        ["attnwarp-eval", "inspect", "tiny", "--export", "a.vtp"],
+        ["attnwarp-eval", "inspect", "tiny", "--export", "a.glb"],
         ["attnwarp-eval", "cache", "info"],
         ["attnwarp-eval", "doctor"],
         ["attnwarp", "fit", "nowhere", "--out", "out"],

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import pyvista
 import torch
 import trimesh
 
@@ -94,23 +93,6 @@ def test_a_flight_goes_evenly_from_one_camera_to_the_other(pair, chosen):
     assert turns == pytest.approx(turns[0], abs=1e-6) and turns[0] > 0.05
     # A full turn around one place, and two cameras in one.
     assert len(scene.fly((source, source), chosen.center, 3)) == 3
-
-
-def test_a_vtp_file_holds_every_number_of_its_pixels(few, tmp_path):
-    pair = few.pair("corrected", "yaw060")
-    write_export(tmp_path / "a.vtp", few, STATE)
-    mesh = pyvista.read(tmp_path / "a.vtp")
-    assert mesh.n_points == int(pair.truth.hits.valid.sum())
-    pixel = int(mesh.point_data["pixel"][1000])
-    result = report(pair, pixel % SIZE, pixel // SIZE)
-    data = {name: mesh.point_data[name][1000] for name in mesh.point_data}
-    np.testing.assert_equal(data["source_xy"], result.xy)
-    np.testing.assert_equal(float(data["tolerance"]), result.tolerance)
-    for verdict in result.verdicts:
-        assert bool(data[verdict.rule]) == verdict.passed
-        np.testing.assert_equal(float(data[f"{verdict.rule}_margin"]), verdict.margin)
-    for name, depth in result.depths.items():
-        np.testing.assert_equal(float(data[f"depth {name}"]), depth)
 
 
 def test_a_glb_file_is_read_by_trimesh_with_colours_in_place_and_upright(few, tmp_path):

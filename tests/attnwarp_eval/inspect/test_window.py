@@ -366,7 +366,7 @@ def test_a_pair_is_made_once_for_numbers_file_and_window(tmp_path, folders, monk
         subject, "Pair", lambda *given, **more: made.append(given[1]) or Pair(*given, **more)
     )
     words = (folders / "scene.ply", "--data", folders, "--view", "3", "--pixel", "16,16")
-    done = invoke(*words, "--export", tmp_path / "a.vtp", "--screenshot", tmp_path / "a.png")
+    done = invoke(*words, "--export", tmp_path / "a.glb", "--screenshot", tmp_path / "a.png")
     assert done.exit_code == 0 and made == ["3"]
 
 
@@ -409,7 +409,7 @@ def test_the_command_refuses_by_name(tmp_path, folders, monkeypatch):
         ((hostile,), "study.json"),
         (small, "no display; draw a picture with --screenshot FILE"),
         ((*small, "--screenshot", tmp_path / "a.jpg"), "a.jpg, expected a name that ends in .png"),
-        ((*small, "--export", tmp_path / "a.stl"), "got .stl, expected .html, .glb or .vtp"),
+        ((*small, "--export", tmp_path / "a.stl"), "got .stl, expected .html or .glb"),
     ):
         failed = invoke(*arguments)
         assert failed.exit_code == 2 and message in failed.stderr, (arguments, failed.stderr)
