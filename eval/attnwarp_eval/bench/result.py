@@ -77,7 +77,7 @@ SHARES = ("done", "seen")
 ORDER = {SAME: "error", OWN: "error", WARPS: "wrong"}
 """Figure that orders the methods of each track."""
 
-Figure = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+FloatOrNull = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=True)
 
 
@@ -95,8 +95,8 @@ class Score:
 
     scene: str
     edit: str
-    figures: dict[str, Figure]
-    by_view: dict[str, dict[str, Figure]]
+    figures: dict[str, FloatOrNull]
+    by_view: dict[str, dict[str, FloatOrNull]]
     remarks: list[str]
 
     @field_validator("figures")

@@ -54,7 +54,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Row:
+class FigureVerdict:
     """The verdict on one metric of one variant over all scenes and views.
 
     Attributes:
@@ -98,7 +98,7 @@ class Comparison:
     """
 
     study: str
-    rows: tuple[Row, ...]
+    rows: tuple[FigureVerdict, ...]
     faults: tuple[Fault, ...]
     added: tuple[str, ...] = field(default=())
     unread: tuple[str, ...] = field(default=())
@@ -314,7 +314,7 @@ def _metrics(cells: list[Measured]) -> set[str]:
 
 def _rows(
     left: Mapping[Key, list[Measured]], right: Mapping[Key, list[Measured]]
-) -> tuple[Row, ...]:
+) -> tuple[FigureVerdict, ...]:
     shared: dict[tuple[str, str], list[Key]] = {}
     for key in sorted(left.keys() & right.keys()):
         shared.setdefault((key[1], key[2]), []).append(key)
@@ -381,7 +381,7 @@ class _Group:
         }
         return cls(probe, variant, metric, key, before, now, paired(first, second), worsening)
 
-    def row(self, adjusted_p: float) -> Row:
+    def row(self, adjusted_p: float) -> FigureVerdict:
         """The group's verdict."""
         flat_before, flat_now = _flat(self.before), _flat(self.now)
         undefined = sum(
@@ -390,7 +390,7 @@ class _Group:
         )
         defined = {name: w for name, w in self.worsening.items() if math.isfinite(w)}
         worst = max(defined, key=lambda name: defined[name], default=None)
-        return Row(
+        return FigureVerdict(
             self.probe,
             self.variant,
             self.key,

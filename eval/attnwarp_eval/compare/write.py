@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.compare.judge import Comparison, Row
+from attnwarp_eval.compare.judge import Comparison, FigureVerdict
 from attnwarp_eval.compare.pictures import Change
 from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Slider, Table
@@ -168,7 +168,7 @@ def _views(count: int) -> str:
     return "1 view is" if count == 1 else f"{count} views are"
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: FigureVerdict) -> list[str]:
     difference = number(row.difference.mean)
     if row.difference.bounded:
         difference += f" ± {number(row.difference.high - row.difference.mean, 2)}"

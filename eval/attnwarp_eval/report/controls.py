@@ -36,7 +36,7 @@ of a method whose wrong features do as well; beside the controls of a study, bot
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Control:
     """Outcome of a comparison's control; "none" without one.
 
     Attributes:
@@ -50,16 +50,16 @@ class Outcome:
     share: Share | None = None
 
 
-UNCONTROLLED = Outcome()
+UNCONTROLLED = Control()
 
 
-def word_of(test: Verdict, control: Outcome) -> Literal[Verdict, "blind"]:
+def word_of(test: Verdict, control: Control) -> Literal[Verdict, "blind"]:
     """Verdict of a test beside its control.
 
     Example:
-        >>> word_of("better", Outcome("not seen", "worse")), word_of("equal", Outcome("not seen"))
+        >>> word_of("better", Control("not seen", "worse")), word_of("equal", Control("not seen"))
         ('blind', 'blind')
-        >>> word_of("better", Outcome("seen", "worse", share=(0.6, 0.4, 0.8)))
+        >>> word_of("better", Control("seen", "worse", share=(0.6, 0.4, 0.8)))
         'blind'
     """
     if control.seen == "not measured":
@@ -166,14 +166,14 @@ def seen_by(results: Results, name: str, baseline: str) -> dict[str, dict[str, b
     return {m: {one: seen(results, name, m, baseline, one) for one in labels} for m in metrics}
 
 
-def outcomes_of(results: Results, name: str, baseline: str) -> dict[str, Outcome]:
+def outcomes_of(results: Results, name: str, baseline: str) -> dict[str, Control]:
     """Metric -> outcome of a variant's controls: seen if it separates any of them from it.
 
     Features from the wrong place must do worse. Otherwise the figure does not depend on the
     source of features, so "can't tell" about two warps says nothing.
     """
     told = seen_by(results, name, baseline)
-    return {m: Outcome("seen" if any(of.values()) else "not seen") for m, of in told.items()}
+    return {m: Control("seen" if any(of.values()) else "not seen") for m, of in told.items()}
 
 
 def controls(results: Results) -> list[Section]:

@@ -15,7 +15,7 @@ from attnwarp_eval.report.claims import Claim
 from attnwarp_eval.report.compared import between, difference_text, in_words, no_verdict
 from attnwarp_eval.report.controls import (
     UNCONTROLLED,
-    Outcome,
+    Control,
     control_share,
     seen,
     share_text,
@@ -52,7 +52,7 @@ class Comparison:
     b: str
     contrast: Contrast
     direction: Literal["higher", "lower"] | None
-    control: Outcome = UNCONTROLLED
+    control: Control = UNCONTROLLED
     claim: Claim | None = None
     means: tuple[float, float] = (math.nan, math.nan)
     p: float = math.nan
@@ -163,7 +163,7 @@ def _measured(results: Results, claim: Claim) -> Comparison | None:
         direction = probe(name).metric(key).direction
         expected: Literal["worse", "better"] = "worse" if "worse" in claim.control else "better"
         label = variant_like(results, claim.control[expected], name)
-        control = Outcome("not measured", expected)
+        control = Control("not measured", expected)
         if label is not None and direction in ("higher", "lower"):
             names.add(label)
             share = None
@@ -172,7 +172,7 @@ def _measured(results: Results, claim: Claim) -> Comparison | None:
                 sign = 1 if direction == "higher" else -1
                 share = control_share(tables[1], table, tables[0], sign=sign)
             told = seen(results, name, key, b, label, expected=expected, yaw=claim.yaw)
-            control = Outcome("seen" if told else "not seen", expected, share)
+            control = Control("seen" if told else "not seen", expected, share)
     finished = claim.planned(results.study) and all(
         cell.record is not None
         for cell in results.cells
