@@ -50,7 +50,6 @@ from attnwarp.fit import (
 from attnwarp.fit.views import shrunk_to
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, write_ply
-from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, MethodSettings, Result
 from attnwarp.methods.algorithms.attention_warping import check_editor
@@ -404,10 +403,6 @@ def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> 
     for candidates in _spellings(names):
         if candidates.count(name) == 1:
             return candidates.index(name)
-    for candidates in _spellings(names):
-        keys = [name_key(candidate) for candidate in candidates]
-        if keys.count(name_key(name)) == 1:
-            return keys.index(name_key(name))
     if name.isdecimal() and int(name) < len(names):
         return int(name)
     if any(name in candidates for candidates in _spellings(left_out)):
@@ -455,10 +450,9 @@ def mask_files(folder: Path, cameras: Any) -> list[Path]:
     plain = [name.parent / name.stem for name in names]
     counts, stems = Counter(plain), Counter(name.stem for name in names)
     paths: list[Path] = []
-    finder = FileFinder(folder)
     for name, short, numbered in zip(names, plain, file_stems(cameras), strict=True):
         own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ())]
-        files = (finder.find(file) for file in (*own, f"{numbered}.png"))
+        files = (folder / file for file in (*own, f"{numbered}.png"))
         found = [file for file in files if file.is_file()]
         if not found:
             alone = stems[name.stem] == 1

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.io.dataset import Dataset, Missing, nearest_rotation, with_images
 from attnwarp.io.file import FileFormatError, visible
-from attnwarp.io.find import FileFinder
 from attnwarp.io.images import image_size
 from attnwarp.io.text import read_text
 
@@ -65,8 +64,7 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
     files = visible((path / CAMERAS).glob(f"*{SUFFIX}"))
     if not files:
         raise FileFormatError(path / CAMERAS, f"holds no camera, expected files *{SUFFIX}")
-    finder = FileFinder(path / IMAGES)
-    images = [finder.find(f"{file.name.removesuffix(SUFFIX)}.jpg") for file in files]
+    images = [path / IMAGES / f"{file.name.removesuffix(SUFFIX)}.jpg" for file in files]
     available = [image.is_file() for image in images]
     if missing_images == "none":
         files = [file for file, there in zip(files, available, strict=True) if there]
@@ -84,7 +82,7 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
         )
     cameras = [_camera(file, image) for file, image in zip(files, images, strict=True)]
     cameras, paths = with_images(
-        path, cameras, images, missing_images=missing_images, resize_cameras=False, finder=finder
+        path, cameras, images, missing_images=missing_images, resize_cameras=False
     )
     return Dataset(cameras, paths)
 

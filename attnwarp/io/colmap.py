@@ -24,8 +24,7 @@ from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning
 from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
-from attnwarp.io.file import FileFormatError, existing_file, is_file
-from attnwarp.io.find import FileFinder
+from attnwarp.io.file import FileFormatError, existing_file, is_file, named_file
 from attnwarp.io.images import IMAGE_SUFFIXES
 from attnwarp.io.lens import Lens
 from attnwarp.io.text import read_text
@@ -163,14 +162,12 @@ def read_colmap(
     folder = _image_folder(path, model, images, "images" if scale == 1 else f"images_{scale}")
     if model != path:
         _warn_of_larger(model, len(poses), folder)
-    finder = FileFinder(folder)
     cameras, paths = with_images(
         source,
         cameras,
-        [finder.find(pose.name) for pose in poses],
+        [named_file(folder, pose.name) for pose in poses],
         missing_images=missing_images,
         resize_cameras=resize_cameras or scale > 1,
-        finder=finder,
         elsewhere="images=FOLDER (--images FOLDER)",
     )
     masks = [_mask(folder.with_name("masks"), pose.name) for pose in poses]
@@ -246,17 +243,9 @@ def _image_folder(
     """Find the folder ``images``; by default the folder of that name nearest to the model."""
     if images is not None:
         return path / images if (path / images).is_dir() else Path(images)
-    roots = [path, model.parent, model.parent.parent, model.parent.parent.parent]
-    # Resolved, since the parent of "." is ".".
-    roots += model.resolve().parents[:3]
-    exact = (root / name for root in roots if (root / name).is_dir())
-    found = next(exact, None) or next((f for root in roots[:4] for f in _named(root, name)), None)
-    return found or path / name
-
-
-def _named(root: Path, name: str) -> list[Path]:
-    """Find folders whose name differs only in case."""
-    return [each for each in FileFinder(root).entries(name) if each.is_dir()]
+    # An absolute path, since the parent of "." is ".".
+    roots = [path, *Path(os.path.normpath(model.absolute())).parents[:3]]
+    return next((root / name for root in roots if (root / name).is_dir()), path / name)
 
 
 def _camera(

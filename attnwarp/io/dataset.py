@@ -15,7 +15,6 @@ from attnwarp import check
 from attnwarp.camera import EXACT_ROTATION, Camera, nearest_orthonormal
 from attnwarp.errors import InputWarning
 from attnwarp.io.file import FileFormatError, is_file
-from attnwarp.io.find import FileFinder
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size, orientation
 from attnwarp.io.lens import Lens
 
@@ -159,13 +158,11 @@ def with_images(
     *,
     missing_images: Missing,
     resize_cameras: bool,
-    finder: FileFinder,
     elsewhere: str = "",
 ) -> tuple[list[Camera], list[Path | None]]:
     """Check that each camera's image exists and has the camera's size.
 
     Args:
-        finder: file finder in the root folder of the images' names.
         elsewhere: hint on naming another folder of images, if possible.
 
     Returns:
@@ -180,8 +177,9 @@ def with_images(
     if absent and missing_images == "error":
         first = ", ".join(str(path) for path in absent[:3])
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
-        near = _near(absent[0], finder)
-        there = f"; {' and '.join(near)} {'are' if near[1:] else 'is'} there" if near else ""
+        stem = absent[0].with_suffix("")
+        others = (Path(f"{stem}{suffix}") for suffix in IMAGE_SUFFIXES)
+        there = next((f"; {other.name} is there" for other in others if is_file(other)), "")
         folder = f", or name their folder: {elsewhere}" if elsewhere else ""
         raise FileFormatError(
             source,
@@ -232,13 +230,3 @@ def _warn_of_turns(source: Path, paths: Sequence[Path]) -> None:
             InputWarning,
             stacklevel=4,
         )
-
-
-def _near(path: Path, finder: FileFinder) -> list[str]:
-    """List likely files for a missing image: those of another suffix, or else those in a folder
-    of another name or from another machine.
-    """
-    stem = path.with_suffix("")
-    each = (Path(f"{stem}{suffix}") for suffix in IMAGE_SUFFIXES)
-    first = next((image.name for image in each if image != path and is_file(image)), None)
-    return [str(found) for found in finder.tail(str(path))] if first is None else [first]

@@ -9,7 +9,7 @@ import platform
 import re
 import time
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
@@ -51,6 +51,21 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def named_file(folder: Path, name: str, suffixes: Sequence[str] = ()) -> Path:
+    """Find the file of a name in a folder: as written, or with backslashes as slashes, as of
+    Windows, and with one of the suffixes. Without one, return the path of the name.
+
+    Example:
+        >>> Path("views").mkdir()
+        >>> Path("views/a.png").touch()
+        >>> named_file(Path("."), ".\\\\views\\\\a", [".png"]).as_posix()
+        'views/a.png'
+    """
+    slashes = name.replace("\\", "/")
+    each = (folder / f"{way}{suffix}" for way in (name, slashes) for suffix in ("", *suffixes))
+    return next(filter(is_file, each), folder / slashes)
 
 
 def check_other(out: Path, source: Path, what: str) -> None:

@@ -31,8 +31,7 @@ from attnwarp.io.dataset import (
     nearest_rotation,
     with_images,
 )
-from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
-from attnwarp.io.find import FileFinder
+from attnwarp.io.file import FileFormatError, existing_file, is_file, named_file, write_atomically
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size
 from attnwarp.io.lens import Lens
 from attnwarp.io.ply import read_points, write_points
@@ -94,8 +93,7 @@ def read_transforms(
     Intrinsics are in the frame or else at the top: ``fl_x``, ``fl_y`` (or ``camera_angle_x``,
     ``camera_angle_y`` in radians), ``cx``, ``cy`` (default: the middle of the image), ``w``, ``h``
     (default: the image's size). ``file_path`` is relative to the file, with or without its
-    extension; a name written by another system (backslashes, other case, URL escapes, another form
-    of accents) finds the unique matching file. Rotations off by up to 1e-4 (float32, or printed
+    extension, and backslashes count as slashes. Rotations off by up to 1e-4 (float32, or printed
     numbers) are replaced by the nearest rotation; larger errors are refused. Frames keep their
     order.
 
@@ -284,7 +282,6 @@ def _read_file(
     names: list[str] = []
     paths: list[Path] = []
     masks: list[Path | None] = []
-    finder = FileFinder(path.parent, IMAGE_SUFFIXES)
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise FileFormatError(
@@ -298,7 +295,7 @@ def _read_file(
                 field=f"frames[{i}].file_path",
                 row=i,
             )
-        image = finder.find(name)
+        image = named_file(path.parent, name, IMAGE_SUFFIXES)
         if not is_file(path.parent / name):
             name = name.replace("\\", "/")  # of Windows
         values = _Values(path, i, name, frame, data)
@@ -313,24 +310,25 @@ def _read_file(
         cameras.append(_camera(values, image))
         lenses.append(lens)
         names.append(name)
-        masks.append(None if "mask_path" in ignore_keys else _mask(values, finder))
+        masks.append(None if "mask_path" in ignore_keys else _mask(values))
         # This camera has the full picture's size; with_images resizes it.
-        paths.append(image if scale == 1 else finder.find(_scaled(path, name, scale)))
-    splits = _splits(path, data, names, paths, split, finder)
+        if scale > 1:
+            image = named_file(path.parent, _scaled(path, name, scale), IMAGE_SUFFIXES)
+        paths.append(image)
+    splits = _splits(path, data, names, paths, split)
     cameras, available = with_images(
         path,
         cameras,
         paths,
         missing_images=missing_images,
         resize_cameras=resize_cameras or scale > 1,
-        finder=finder,
     )
     points = colors = None
     ply = data.get("ply_file_path") if with_points else None
     if ply is not None:
         if not isinstance(ply, str):
             raise FileFormatError(path, f"got {brief(ply)}, expected a path", field="ply_file_path")
-        cloud = FileFinder(path.parent).find(ply)
+        cloud = named_file(path.parent, ply)
         if not is_file(cloud):
             raise FileFormatError(
                 path, f"{cloud} is missing; put it there or remove the key", field="ply_file_path"
@@ -342,11 +340,13 @@ def _read_file(
     return Dataset(cameras, available, points, colors, splits, applied, lenses, masks)
 
 
-def _mask(values: _Values, finder: FileFinder) -> Path | None:
+def _mask(values: _Values) -> Path | None:
     name = values.get("mask_path")
     if not name:
         return None
-    mask = finder.find(name) if isinstance(name, str) else None
+    mask = None
+    if isinstance(name, str):
+        mask = named_file(values.path.parent, name, IMAGE_SUFFIXES)
     if mask is None or not is_file(mask):
         raise values.refuse(
             "mask_path",
@@ -392,7 +392,6 @@ def _splits(
     names: list[str],
     images: list[Path],
     split: str | None,
-    finder: FileFinder,
 ) -> list[str | None]:
     """Determine the split of each frame: from the file's lists, else ``split``.
 
@@ -410,7 +409,10 @@ def _splits(
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise FileFormatError(path, "expected a list of paths", field=key)
         for name in listed:
-            ways = (os.path.normpath(way) for way in (path.parent / name, finder.find(name)))
+            ways = (
+                os.path.normpath(way)
+                for way in (path.parent / name, named_file(path.parent, name, IMAGE_SUFFIXES))
+            )
             members = next((frames[way] for way in ways if way in frames), [])
             if not members:
                 raise FileFormatError(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError, suggest
-from attnwarp.io.find import FileFinder
+from attnwarp.io.file import named_file
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.scene.base import FARTHEST, Vector
 from attnwarp_eval.scene.bodies import BodySpec
@@ -273,7 +273,7 @@ class Scene:
     def mesh_path(self, spec: MeshSpec) -> Path:
         """Path of the mesh file of an object."""
         base = self.path.parent if self.path else Path()
-        return FileFinder(base).find(str(Path(spec.file).expanduser()))
+        return named_file(base, str(Path(spec.file).expanduser()))
 
     @functools.cached_property
     def world_hash(self) -> str:

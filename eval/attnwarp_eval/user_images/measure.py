@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -22,7 +22,6 @@ import numpy.typing as npt
 from attnwarp.devices import device_of
 from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
 from attnwarp.errors import InputError
-from attnwarp.io.find import name_key
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
@@ -221,7 +220,6 @@ def measure(
         if getattr(inputs, name) is not None
     }
     for name in folders:
-        folders[name] = _as_spelled(folders[name], folders.get("renders", {}))
         maps = normal_maps(getattr(inputs, name))
         if maps:
             done.notes.append(
@@ -303,18 +301,6 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
             f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}"
         )
     return pictures
-
-
-def _as_spelled(pictures: dict[str, Path], renders: Mapping[str, Path]) -> dict[str, Path]:
-    """Rename pictures of a folder to the names of renders that differ only in case, in the form
-    of accents or as URLs, as other systems write them.
-    """
-    one, two = (Counter(map(name_key, names)) for names in (pictures, renders))
-    spelled = {name_key(name): name for name in renders}
-    return {
-        spelled[key] if one[key := name_key(name)] == two[key] == 1 else name: path
-        for name, path in pictures.items()
-    }
 
 
 def normal_maps(folder: Path) -> list[str]:

@@ -268,7 +268,7 @@ def saved_anew(source, target):
 AGAIN = {
     "the same frame": (None, "a.png", 0.0),
     "spelled otherwise": (None, "./images/../a.png", 0.0),
-    "spelled by Windows": (None, ".\\A.PNG", 0.0),
+    "spelled by Windows": (None, ".\\a.png", 0.0),
     "the same picture at another pose": (None, "a.png", 0.3),
     "a link": (lambda a, b: b.symlink_to(a), "b.png", 0.3),
     "a hard link": (lambda a, b: b.hardlink_to(a), "b.png", 0.3),

@@ -493,22 +493,6 @@ def test_a_picture_is_measured_as_viewers_turn_it(tmp_path, turn):
         assert "edited/a.png is turned as its EXIF tag asks): a pair must have" in refused
 
 
-def test_pictures_are_paired_by_names_that_other_systems_spell_otherwise(tmp_path):
-    """Oracle: the squared error of each pair that was written."""
-    random = np.random.default_rng(0)
-    names = {"\u00e9": "e\u0301", "View 1": "view%201", "B": "b", "c": "c", "C": "C"}
-    psnr = {}
-    for one, two in names.items():
-        render, edited = random_picture(random), random_picture(random)
-        write(tmp_path / f"renders/{one}.png", render)
-        write(tmp_path / f"edited/{two}.PNG", edited)
-        psnr[one] = -10 * math.log10(((render / 255.0 - edited / 255.0) ** 2).mean())
-    result = pixels(tmp_path, "--perceptual=none")
-    assert result.exit_code == 0, result.output
-    measured = saved(tmp_path)["metrics"]["edit.psnr_mean"]["views"]
-    assert measured == pytest.approx(psnr, abs=1e-4)
-
-
 def test_a_jpeg_damaged_inside_is_not_measured(tmp_path):
     """Its end is there, and the decoder fills what is missing of it."""
     picture = write(tmp_path / "renders/a.jpg", random_picture(np.random.default_rng(0), (48, 64)))
