@@ -14,7 +14,7 @@ import mmap
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -46,12 +46,8 @@ hundredth of a standard deviation changes no pixel by more than 0.6 % of the spl
 
 Coordinates = Literal["auto", "world", "relative"]
 
-COLORS = (
-    ("red", "green", "blue"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-    ("r", "g", "b"),
-)
-"""Names of a point's colours: of most programs, of MeshLab, of some scanners."""
+COLORS = ("red", "green", "blue")
+"""Names of a point's colours."""
 
 FILTER_3D = "filter_3D"
 """Property specific to Mip-Splatting's files."""
@@ -136,22 +132,21 @@ def read_ply(
     with np.errstate(over="ignore"):
         scales = np.exp(_stack(path, columns, names, np.float64)).astype(np.float32)
         alpha = 1.0 / (1.0 + np.exp(-logits))
-    if FILTER_3D in columns and kind == "3d":
+    flags, default = (antialiased, header.antialiased, False), SCREEN_FILTER
+    merged = FILTER_3D in columns and kind == "3d"
+    if merged:
         scales, share = _filtered(columns[FILTER_3D], scales)
         alpha *= share
-        if antialiased is None and not header.flags:
-            antialiased = True
-        width = header.width(MIP_SCREEN_FILTER, screen_filter)
+        flags, default = (antialiased, header.antialiased, True), MIP_SCREEN_FILTER
+    antialiased = next(flag for flag in flags if flag is not None)
+    width = next(w for w in (screen_filter, header.screen_filter, default) if w is not None)
+    if merged:
         _warn(
             f"{path}: is of Mip-Splatting: its {FILTER_3D} is merged into scales and opacities, and"
             f" the splats are {'' if antialiased else 'not '}rendered antialiased, with a screen"
             f" filter of {width:g} px^2; of another program, such as GOF, give its own by"
             " screen_filter (--screen-filter)"
         )
-    else:
-        width = header.width(SCREEN_FILTER, screen_filter)
-    if antialiased is None:
-        antialiased = header.antialiased(path)
     try:
         check.finite(xyz, "x, y, z")
         offset, means = split_origin(xyz)
@@ -199,8 +194,8 @@ def write_ply(
             :data:`WORLD_TOLERANCE`.
 
     Warns:
-        InputWarning: "auto" writes an origin, "world" moves splats by more than
-            :data:`WORLD_TOLERANCE`, or ``third_scale`` is longer than every splat.
+        InputWarning: "auto" writes an origin, or "world" moves splats by more than
+            :data:`WORLD_TOLERANCE`.
 
     Raises:
         ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
@@ -227,13 +222,6 @@ def write_ply(
         if not (np.isfinite(third_scale) and third_scale > 0):
             raise ValueError(
                 f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
-            )
-        if len(g) and third_scale > scales.max():
-            warnings.warn(
-                f"{path}: third_scale {third_scale:g} is longer than every splat"
-                f" ({scales.max():.3g} at most), so viewers show needles; {THIRD_SCALE} is usual",
-                InputWarning,
-                stacklevel=2,
             )
         scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
     origin, means = _place(Path(path), original, coordinates)
@@ -271,16 +259,12 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
 
     Returns:
         points: (P, 3) float64.
-        colors: (P, 3) uint8 from ``red green blue``, or from another triple of :data:`COLORS` with
-            a warning; None if the file has no colours.
+        colors: (P, 3) uint8 from ``red green blue``; None if the file has no colours.
 
     Raises:
         FileNotFoundError: the file does not exist.
         FileFormatError: the file is not a PLY, is truncated, lacks ``x y z``, or has a non-finite
             value or colours that are not uchar.
-
-    Warns:
-        InputWarning: the colours have unusual names.
 
     Example:
         >>> from attnwarp.io import read_points, write_points
@@ -296,21 +280,15 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
         raise FileFormatError(
             path, "not every point is finite; get the file again", field="x, y, z"
         )
-    names = next((triple for triple in COLORS if set(triple) & set(columns)), None)
-    if names is None:
+    if not set(COLORS) & set(columns):
         return points, None
-    if names != COLORS[0]:
-        _warn(f"{path}: its colours are taken from the properties {', '.join(names)}")
-    for name in names:
-        if name not in columns:
-            raise FileFormatError(
-                path, "missing, though other colours are there; write all three", field=name
-            )
+    for name in COLORS:
+        _check_there(path, columns, name)
         if columns[name].dtype.kind not in "iu" or columns[name].dtype.itemsize != 1:
             raise FileFormatError(
                 path, f"got type {columns[name].dtype.name}, expected uchar (0 to 255)", field=name
             )
-    return points, np.stack([columns[name] for name in names], axis=1).astype(np.uint8)
+    return points, np.stack([columns[name] for name in COLORS], axis=1).astype(np.uint8)
 
 
 def write_points(
@@ -342,7 +320,7 @@ def write_points(
         check.shape(rgb, (len(xyz), 3), "colors")
         if rgb.dtype != np.uint8:
             raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
-        parts.append((COLORS[0], "u1", rgb))
+        parts.append((COLORS, "u1", rgb))
     _write_vertices(path, parts)
 
 
@@ -459,84 +437,44 @@ def _read_sh(path: Path, columns: Columns) -> npt.NDArray[np.float32]:
     return np.concatenate([dc[:, None], rest], axis=1)
 
 
+@dataclass
 class _Header:
-    """Header comments about the splats; contradictions are stored until a value is
-    requested.
-    """
+    """Header comments about the splats; of two that contradict each other the last counts."""
 
-    def __init__(self) -> None:
-        self.kinds: dict[Kind, str] = {}
-        self.flags: dict[bool, str] = {}
-        self.origin: Array = np.zeros(3)
-        self.screen_filter: float | None = None
-        self.far = math.inf
-
-    def width(self, default: float, given: float | None) -> float:
-        """Choose the screen filter, px^2: the given one, the file's, or the default."""
-        if given is not None:
-            return given
-        return default if self.screen_filter is None else self.screen_filter
-
-    def antialiased(self, path: Path) -> bool:
-        if len(self.flags) > 1:
-            both = " and ".join(map(repr, self.flags.values()))
-            raise FileFormatError(
-                path,
-                f"comments contradict each other: {both}; pass antialiased=True or False"
-                " (--antialiased or --no-antialiased)",
-            )
-        return next(iter(self.flags), False)
+    kind: Kind | None = None
+    antialiased: bool | None = None
+    origin: Array = field(default_factory=lambda: np.zeros(3))
+    screen_filter: float | None = None
+    far: float = math.inf
 
 
 def _read_comments(path: Path, comments: list[str]) -> _Header:
     header = _Header()
     for comment in comments:
-        match comment.lower().split():
-            case ["attnwarp", "kind", "2d"]:
-                header.kinds["2d"] = comment
-            case ["attnwarp", "kind", "3d"]:
-                header.kinds["3d"] = comment
-            case ["attnwarp", "origin", *numbers]:
-                try:
-                    header.origin = np.array([float(v) for v in numbers])
-                except ValueError:
-                    header.origin = np.full(1, np.nan)
-                if header.origin.shape != (3,) or not np.isfinite(header.origin).all():
-                    raise FileFormatError(
-                        path, f"got {comment!r}, expected three finite numbers", field="origin"
-                    )
-            case ["attnwarp", "screen_filter", number]:
-                try:
+        try:
+            match comment.lower().split():
+                case ["attnwarp", "kind", ("2d" | "3d") as kind]:
+                    header.kind = kind
+                case ["attnwarp", "origin", x, y, z]:
+                    header.origin = np.array([float(v) for v in (x, y, z)])
+                    check.finite(header.origin, "origin")
+                case ["attnwarp", "screen_filter", number]:
                     header.screen_filter = check.number(
                         float(number), LEAST_FILTER, LARGEST_FILTER, "screen_filter"
                     )
-                except ValueError:
-                    raise FileFormatError(
-                        path,
-                        f"got {comment!r}, expected px^2 in [{LEAST_FILTER:g}, {LARGEST_FILTER:g}]",
-                        field="screen_filter",
-                    ) from None
-            case ["attnwarp", "far", number]:
-                try:
+                case ["attnwarp", "far", number]:
                     header.far = float(number)
-                except ValueError:
-                    header.far = math.nan
-                if not header.far > 0:
-                    raise FileFormatError(
-                        path, f"got {comment!r}, expected a positive distance", field="far"
-                    )
-            # Some files have no space between colon and tag.
-            case ["splatrendermode:" | "splatrendermode", mode] if mode in (
-                "mip",
-                "default",
-                "2dgs",
-            ):
-                if mode == "2dgs":
-                    header.kinds["2d"] = comment
-                else:
-                    header.flags[mode == "mip"] = comment
-            case ["antialiased", ("0" | "1") as flag]:
-                header.flags[flag == "1"] = comment
+                case ["attnwarp", *_]:
+                    raise ValueError("not known to this version")
+                # Some files have no space between colon and tag.
+                case ["splatrendermode:" | "splatrendermode", "2dgs"]:
+                    header.kind = "2d"
+                case ["splatrendermode:" | "splatrendermode", ("mip" | "default") as mode]:
+                    header.antialiased = mode == "mip"
+                case ["antialiased", ("0" | "1") as flag]:
+                    header.antialiased = flag == "1"
+        except ValueError as error:
+            raise FileFormatError(path, f"damaged comment {comment!r}: {error}") from None
     return header
 
 
@@ -546,16 +484,7 @@ def _recognise(
     """Determine the kind of the splats and the names of its scales."""
     for name in ("scale_0", "scale_1"):
         _check_there(path, columns, name)
-    if kind is None:
-        if len(header.kinds) > 1:
-            both = " and ".join(map(repr, header.kinds.values()))
-            raise FileFormatError(
-                path,
-                f"comments contradict each other: {both}; pass kind='2d' or kind='3d' (--kind)",
-            )
-        kind = next(iter(header.kinds), None)
-    if kind is None:
-        kind = _kind_by_scales(path, columns)
+    kind = kind or header.kind or _kind_by_scales(path, columns)
     if kind == "2d":
         return "2d", ("scale_0", "scale_1")
     if "scale_2" not in columns:

@@ -112,15 +112,6 @@ def test_splats_that_went_through_cloudcompare_are_read(tmp_path):
     assert read_ply(tmp_path / "a.ply").digest() == read_ply(tmp_path / "b.ply").digest()
 
 
-@pytest.mark.parametrize("names", [("diffuse_red", "diffuse_green", "diffuse_blue"), tuple("rgb")])
-def test_colours_of_other_names_are_read_and_said(names, tmp_path):
-    columns = {**dict.fromkeys("xyz", "float"), **dict.fromkeys(names, "uchar")}
-    (tmp_path / "a.ply").write_text(by_name(None, [[1, 2, 3, 250, 0, 7]], columns))
-    with pytest.warns(UserWarning, match=f"colours are taken from the properties {names[0]}"):
-        _, colors = read_points(tmp_path / "a.ply")
-    assert colors.tolist() == [[250, 0, 7]]
-
-
 def test_bytes_that_are_no_text_are_still_refused_by_file(tmp_path):
     (tmp_path / "transforms.json").write_bytes(codecs.BOM_UTF8 + b"\xff\xfe{")
     with pytest.raises(InputError, match="transforms.json"):
