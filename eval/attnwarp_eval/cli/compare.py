@@ -156,12 +156,18 @@ def _page(
 
 def _run(folder: Path) -> tuple[Snapshot, Pictures, list[str]]:
     """A run, its pictures, and notes for the reader; its records, far larger, are freed."""
+    from attnwarp.errors import InputError
     from attnwarp_eval.compare.pictures import pictures_of_run
     from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
-    results = read_results(Store(folder))
+    store = Store(folder)
+    results, done = read_results(store), store.done()
+    # A damaged record says nothing of the code that is judged.
+    damaged = [failure.error for failure in results.failures if failure.id in done]
+    if damaged:
+        raise InputError(damaged[0])
     return snapshot(results), pictures_of_run(results, folder), _of_other_code(results, folder)
 
 

@@ -158,7 +158,7 @@ def test_a_figure_that_is_lost_has_the_value_that_it_had():
 
 
 @pytest.mark.parametrize("damage", ["removed", "truncated"])
-def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
+def test_a_dropped_cell_is_a_regression_and_a_damaged_one_is_an_error(stored, run, damage):
     store = Store(run)
     cell = next(c for c in store.read_study()["cells"] if c["probe"] == "depth")
     if damage == "removed":
@@ -166,13 +166,16 @@ def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
     else:
         store.path(cell["id"]).write_bytes(b"{")
     done = gate(stored / "baseline.jsonl", run)
-    assert done.exit_code == 1
-    assert "missing  spheres / depth / corrected / seed 0" in done.stdout
-    assert ("not JSON" in done.stdout) == (damage == "truncated")
+    if damage == "removed":
+        assert done.exit_code == 1
+        assert "missing  spheres / depth / corrected / seed 0" in done.stdout
+    else:
+        assert done.exit_code == 2
+        assert done.stderr.count("\n") == 1 and f"{store.path(cell['id'])}: not JSON" in done.stderr
     # An incomplete run is no baseline, neither as a folder nor to be written.
     assert gate(run, stored / "variants").exit_code == 2
     path = run.parent / "new.jsonl"
-    assert gate(path, run, "--update").exit_code == 3
+    assert gate(path, run, "--update").exit_code == (3 if damage == "removed" else 2)
     assert not path.exists()
 
 
