@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.metrics._pictures import picture, region
-from attnwarp_eval.metrics.arrays import Array, Mask, mean, quantile, share
+from attnwarp_eval.metrics.arrays import Array, Mask, mean
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
@@ -41,36 +41,23 @@ class Disagreement:
 
     Attributes:
         counted: (H, W) bool, pixels that were compared.
-        linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
-        srgb: (H, W, 3) the same for sRGB values.
+        srgb: (H, W, 3) target minus source at the same point, sRGB; NaN elsewhere.
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
         candidates: number of pixels considered; at exact correspondences, pixels that have
             a position.
     """
 
     counted: Mask
-    linear: Array
     srgb: Array
     delta_e: Array
     candidates: int
 
     def figures(self, prefix: str = "") -> dict[str, float]:
         """The ``consistency.*`` figures with ``prefix`` before each name; NaN without pixels."""
-        linear, srgb, delta_e = (
-            self.linear[self.counted],
-            self.srgb[self.counted],
-            self.delta_e[self.counted],
-        )
-        pixels = int(self.counted.sum())
         values = {
-            "mae_linear": mean(np.abs(linear)),
-            "rmse_linear": float(np.sqrt(mean(linear**2))),
-            "mae_srgb": mean(np.abs(srgb)),
-            "rmse_srgb": float(np.sqrt(mean(srgb**2))),
-            "delta_e": mean(delta_e),
-            "delta_e_p95": quantile(delta_e, 0.95),
-            "share": share(pixels, self.candidates),
-            "pixels": pixels,
+            "mae_srgb": mean(np.abs(self.srgb[self.counted])),
+            "delta_e": mean(self.delta_e[self.counted]),
+            "pixels": int(self.counted.sum()),
         }
         return {f"consistency.{prefix}{name}": value for name, value in values.items()}
 
@@ -208,15 +195,13 @@ def disagreement(
 
     counted = pixels & has_taps(xy, source.shape)
     shape = counted.shape
-    linear, srgb, delta_e = (np.full((*shape, *rest), np.nan) for rest in ((3,), (3,), ()))
+    srgb, delta_e = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
     if counted.any():
-        source_colors = sampled(to_linear(source), xy[counted])
+        source_colors = to_srgb(sampled(to_linear(source), xy[counted]))
         target_colors = target[counted]
-        source_srgb_colors = to_srgb(source_colors)
-        linear[counted] = to_linear(target_colors) - source_colors
-        srgb[counted] = target_colors - source_srgb_colors
-        delta_e[counted] = deltaE_ciede2000(rgb2lab(target_colors), rgb2lab(source_srgb_colors))
-    return Disagreement(counted, linear, srgb, delta_e, candidates)
+        srgb[counted] = target_colors - source_colors
+        delta_e[counted] = deltaE_ciede2000(rgb2lab(target_colors), rgb2lab(source_colors))
+    return Disagreement(counted, srgb, delta_e, candidates)
 
 
 def _grey(image: Array) -> npt.NDArray[np.uint8]:

@@ -77,17 +77,6 @@ class Registry(dict[str, Metric]):
         return self[name]
 
 
-_DISAGREEMENT: tuple[tuple[str, str, Direction, float, float, str], ...] = (
-    ("mae_linear", "ratio", "lower", 1e-5, 1e-2, "mean absolute colour difference of two views in linear light"),
-    ("rmse_linear", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in linear light"),
-    ("mae_srgb", "ratio", "lower", 1e-5, 1e-2, "mean absolute colour difference of two views in sRGB: the reprojection loss"),
-    ("rmse_srgb", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in sRGB"),
-    ("delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 between two views"),
-    ("delta_e_p95", "dE00", "lower", 1e-2, 1e-2, "95th percentile of CIEDE2000 between two views"),
-    ("share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
-    ("pixels", "pixels", "none", 0, 0, "pixels compared"),
-)
-
 _SPECS = (
     Metric("calibration.mitsuba_agrees", "share", "higher", 1e-3, 0, "pixels whose point Mitsuba finds as the ray caster"),
     Metric("warp.epe_median", "px", "lower", 1e-4, 1e-3, "median endpoint error, visible pixels"),
@@ -169,13 +158,17 @@ _SPECS = (
     Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
     Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
     *(
-        Metric(f"consistency.{prefix}{name}", unit, direction, atol, rtol, f"{what}, {pixels}")
-        for prefix, pixels in (
+        metric
+        for prefix, where in (
             ("", "at exact correspondences"),
             ("flow_", "along optical flow"),
             ("rendered_", "at correspondences of rendered depth"),
         )
-        for name, unit, direction, atol, rtol, what in _DISAGREEMENT
+        for metric in (
+            Metric(f"consistency.{prefix}mae_srgb", "ratio", "lower", 1e-5, 1e-2, f"mean absolute sRGB difference of two views {where}: the reprojection loss"),
+            Metric(f"consistency.{prefix}delta_e", "dE00", "lower", 1e-3, 1e-2, f"mean CIEDE2000 between two views {where}"),
+            Metric(f"consistency.{prefix}pixels", "pixels", "none", 0, 0, f"pixels compared {where}"),
+        )
     ),
     Metric("consistency.colmap_registered", "share", "higher", 1e-4, 0, "views that COLMAP's largest model has"),
     Metric("consistency.colmap_points", "points", "higher", 0, 5e-2, "its 3D points"),
