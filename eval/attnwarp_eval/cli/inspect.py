@@ -66,8 +66,8 @@ def inspect(
     color: Annotated[
         str,
         option(
-            "Colour the surface by picture, mask, rules or incidence; with truth by endpoint error,"
-            " depth error or covered by; in an edit by edit disagreement."
+            "Colour the surface by picture, mask, rules or incidence; with truth by endpoint error"
+            " or depth error; in an edit by edit disagreement."
         ),
     ] = "mask",
     splats: Annotated[bool, option("Draw the splats as discs, beside the surface.")] = False,

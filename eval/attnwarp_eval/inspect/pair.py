@@ -53,12 +53,11 @@ COLORINGS = (
     "endpoint error",
     "depth error",
     "incidence",
-    "covered by",
     EDIT_DISAGREEMENT,
 )
 """Colourings of the target's surface; :attr:`Pair.colorings` has those that a pair can show."""
 
-NEEDS_TRUTH = ("endpoint error", "depth error", "covered by")
+NEEDS_TRUTH = ("endpoint error", "depth error")
 
 ACCEPTED, REJECTED = "#2ca25f", "#4a4a4a"
 
@@ -66,7 +65,7 @@ CATEGORIES = (
     "#1f78b4", "#e31a1c", "#17becf", "#ff7f00", "#6a3d9a", "#b15928", "#a6cee3", "#fb9a99",
     "#b2df8a", "#fdbf6f", "#cab2d6", "#ffd92f",
 )  # fmt: skip
-"""Colours of rules and of views, in order (ColorBrewer, Paired; its dark green resembles
+"""Colours of rules, in order (ColorBrewer, Paired; its dark green resembles
 ``ACCEPTED``, so cyan replaces it)."""
 
 DISAGREEMENT = 0.3
@@ -296,37 +295,6 @@ class Pair:
         return np.where(passed.all(axis=0), -1, passed.argmin(axis=0))
 
     @cached_property
-    def covering(self) -> npt.NDArray[np.int64]:
-        """(H, W) number of the view that sees the surface at the smallest incidence, -1 for none.
-
-        Number 0 is the source; the others are the targets in order, without this one.
-        """
-        assert not isinstance(self.views, Capture) and self.truth is not None
-        hits, geometry = self.truth.hits, self.views.geometry
-        points, normals = hits.point[hits.valid], hits.normal[hits.valid]
-        best = np.full(len(points), -1)
-        largest = np.zeros(len(points))
-        for number, name in enumerate(self._covering_views()):
-            camera = self.views.camera(name)
-            xy, z = camera.project(points)
-            with np.errstate(invalid="ignore"):
-                inside = (z > 0) & ((xy >= 0) & (xy <= (camera.width, camera.height))).all(axis=1)
-            ray = camera.position - points
-            cosine = np.einsum("ni,ni->n", normals, ray) / np.linalg.norm(ray, axis=1)
-            better = np.flatnonzero(inside & (cosine > largest))
-            ids = hits.primitive_id[hits.valid][better]
-            visible = geometry.visible_from(points[better], normals[better], ids, camera)
-            best[better[visible]] = number
-            largest[better[visible]] = cosine[better[visible]]
-        covering = np.full(self.size, -1)
-        covering[hits.valid] = best
-        return covering
-
-    def _covering_views(self) -> list[str]:
-        others = [name for name in self.views.targets if name != self.target]
-        return [self.views.source.name, *others][: len(CATEGORIES)]
-
-    @cached_property
     def disagreement(self) -> Array:
         """(H, W) mean absolute difference of the target's edit and the source's, warped.
 
@@ -409,10 +377,8 @@ class Pair:
         assert truth is not None
         if coloring == "endpoint error":
             return pictures.endpoint_map(self.view.correspondence.xy.numpy(), truth)
-        if coloring == "depth error":
-            depth = np.asarray(self.surfaces[1].depth, dtype=np.float64)
-            return pictures.depth_map(depth, truth.hits)
-        return tinted([*CATEGORIES, REJECTED], self.covering, target)
+        depth = np.asarray(self.surfaces[1].depth, dtype=np.float64)
+        return pictures.depth_map(depth, truth.hits)
 
     def legend(self, coloring: str) -> Legend:
         """(text, "#rrggbb") of the colours' meanings."""
@@ -426,9 +392,6 @@ class Pair:
                 for number, rule in enumerate(self.view.rules)
             ]
             return [("accepted", ACCEPTED), *rules]
-        if coloring == "covered by":
-            views = zip(self._covering_views(), CATEGORIES, strict=False)
-            return [*views, ("no view", REJECTED)]
         if coloring == "endpoint error":
             low, high = pictures.EPE_RANGE
             values = np.geomspace(low, high, 4)

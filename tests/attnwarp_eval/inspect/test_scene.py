@@ -54,7 +54,7 @@ def test_the_surface_carries_each_pixels_colour_at_its_true_point(pair):
         assert np.array_equal(mesh.point_data["colors"], np.clip(flat, 0, 255).astype(np.uint8))
         assert np.array_equal(mesh.points, pair.truth.hits.point.reshape(-1, 3)[index])
     assert set(pair.colorings) == {
-        "picture", "mask", "rules", "endpoint error", "depth error", "incidence", "covered by",
+        "picture", "mask", "rules", "endpoint error", "depth error", "incidence",
     }  # fmt: skip
     with pytest.raises(ValueError, match="coloring: got 'green'"):
         pair.colors("green")
