@@ -194,30 +194,17 @@ def encoders(
         str | None,
         typer.Argument(help="Load this encoder and show what it is; without it, list them."),
     ] = None,
-    as_json: Annotated[bool, option("Print JSON in place of lines.", None, "--json")] = False,
 ) -> None:
     """List the encoders that metrics can use.
 
     Some ship with the package, others are read from a folder of yours.
     """
-    import json
-
     with clear_errors():
         from attnwarp.encoders import BUNDLED, REAL, load_encoder
 
         if name is not None:
             about = load_encoder(name).about.to_dict()
-            lines = (
-                [json.dumps(about, indent=2)]
-                if as_json
-                else [f"{key:15} {value}" for key, value in about.items()]
-            )
-        elif as_json:
-            rows = [
-                {"name": n, "kind": kind, "about": line, "bundled": n in BUNDLED}
-                for n, (kind, line) in (BUNDLED | REAL).items()
-            ]
-            lines = [json.dumps(rows, indent=2)]
+            lines = [f"{key:15} {value}" for key, value in about.items()]
         else:
             lines = ["ships with the package:"]
             lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in BUNDLED.items()]

@@ -213,20 +213,13 @@ def _check_no_capture(folder: Path) -> None:
 @app.command()
 def edits(
     scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
-    as_json: Annotated[
-        bool,
-        option("Print JSON, with the content hash of each edited scene.", None, "--json"),
-    ] = False,
 ) -> None:
     """List the edits that a scene names, with what each one asks for and does."""
-    import json
-
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
-        from attnwarp_eval.truth.edits import describe, to_dict
+        from attnwarp_eval.truth.edits import describe
 
-        loaded = load_scene(scene)
-        typer.echo(json.dumps(to_dict(loaded), indent=2) if as_json else describe(loaded))
+        typer.echo(describe(load_scene(scene)))
 
 
 @app.command()

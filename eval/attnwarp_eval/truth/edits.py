@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -58,29 +57,3 @@ def _kinds(change: ObjectChange) -> Iterator[str]:
     for name in ("texture", "material", "recolor", "paint"):
         if getattr(change, name):
             yield name
-
-
-def to_dict(scene: Scene) -> dict[str, Any]:
-    """A scene's edits as JSON, with the content hash of each result."""
-    return {
-        "scene": scene.name,
-        "content": scene.content_hash,
-        "edits": [
-            {
-                "name": edit.name,
-                "instruction": edit.instruction,
-                "source": edit.source,
-                "target": edit.target,
-                "ambiguous": edit.ambiguous,
-                "results": [
-                    {
-                        "answer": one.name if one else None,
-                        "target": one.target if one else edit.target,
-                        "content": scene.edited(edit.name, one.name if one else None).content_hash,
-                    }
-                    for one in edit.answers or (None,)
-                ],
-            }
-            for edit in scene.edits
-        ],
-    }
