@@ -226,33 +226,19 @@ def edits(
 def calibrate(
     scene: Annotated[str, typer.Argument(help="Name of a shipped scene, or the path of its YAML.")],
 ) -> None:
-    """Measure how many bounces of light a scene and its edits need, and write them into its file.
+    """Measure how many bounces of light a scene and its edits need, and print lines for its file.
 
-    A scene takes some ten seconds, minutes where light goes far, as through glass.
+    The scene's line belongs under `appearance`, an edit's or answer's under its name. A scene takes
+    some ten seconds, minutes where light goes far, as through glass.
     """
     with clear_errors(), reporter() as report:
-        from attnwarp.errors import InputError
-        from attnwarp.io.text import read_text
-        from attnwarp_eval.files import write_atomic
-        from attnwarp_eval.scene.file import load_scene, scene_file
-        from attnwarp_eval.scene.rewrite import with_bounces
+        from attnwarp_eval.scene.file import load_scene
         from attnwarp_eval.truth.bounces import search, worlds
 
-        path, numbers = scene_file(scene), {}
-        for which, world in worlds(load_scene(scene)):
+        for world in worlds(load_scene(scene)):
             report.step(0, 0, f"{world.name}: measuring how often its light bounces")
             found = search(world)
-            numbers[which] = found.bounces
-            # After each scene, so that results survive an interruption.
-            write_atomic(path, with_bounces(read_text(path), numbers).encode())
-            typer.echo(f"{world.name}: {found.words}")
-        for which, world in worlds(load_scene(path)):
-            if world.spec.appearance.bounces != numbers[which]:
-                raise InputError(
-                    f"{path}: {world.name} has no entry of its own in the file, as it is repeated"
-                    f" by an alias; write it out, with bounces: {numbers[which]}"
-                )
-    typer.echo(path)
+            typer.echo(f"bounces: {found.bounces}  # {world.name}: {found.words}")
 
 
 @app.command()

@@ -184,7 +184,7 @@ class AppearanceSpec(Spec):
     """Settings of the pictures: light bounces (1 is direct light only) and samples a pixel.
 
     ``bounces: unlimited`` follows light without a cap, as does a file without a number.
-    ``attnwarp-eval scenes calibrate`` writes the fewest bounces that hold every view's light within
+    ``attnwarp-eval scenes calibrate`` prints the fewest bounces that hold every view's light within
     1 %. Every surface and every scattering counts as a bounce.
     """
 

@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene import transport
-from attnwarp_eval.scene.rewrite import Which
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.equivalence import paired_test
 from attnwarp_eval.truth.mitsuba import build, comparable, render_plan
@@ -192,13 +191,12 @@ def search(scene: Scene) -> Answer:
     return Answer(number, last, fewer, made_by)
 
 
-def worlds(scene: Scene) -> Iterator[tuple[Which, Scene]]:
+def worlds(scene: Scene) -> Iterator[Scene]:
     """The scene, then each of its edited scenes."""
-    yield (None, None), scene
+    yield scene
     for edit in scene.edits:
         for answer in edit.answers or (None,):
-            name = answer.name if answer else None
-            yield (edit.name, name), scene.edited(edit.name, name)
+            yield scene.edited(edit.name, answer.name if answer else None)
 
 
 def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:

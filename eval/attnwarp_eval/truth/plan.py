@@ -75,7 +75,7 @@ def open_bounces(scene: Scene) -> list[str]:
         return []
     return [
         "the file names no number of bounces, so light is followed until it is gone;"
-        " `attnwarp-eval scenes calibrate FILE` measures how many are enough and writes the number"
+        " `attnwarp-eval scenes calibrate FILE` measures how many are enough"
     ]
 
 
