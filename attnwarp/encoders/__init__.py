@@ -75,7 +75,7 @@ REAL: dict[str, tuple[Kind, str]] = {
     ),
     "lpips:FILE_OR_FOLDER": (
         "perceptual",
-        "LPIPS: a torchvision backbone (alex, vgg, squeeze) and its linear layers",
+        "LPIPS: a torchvision backbone (alex, vgg) and its linear layers",
     ),
 }
 """Encoders read from the user's files: pattern -> (kind, description)."""

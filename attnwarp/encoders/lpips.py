@@ -40,7 +40,7 @@ SUFFIXES = (".pth", ".pt", ".bin", ".safetensors")
 
 @dataclass(frozen=True)
 class Backbone:
-    """Backbone network, one of three.
+    """Backbone network, one of two.
 
     Attributes:
         name: name in LPIPS.
@@ -64,30 +64,8 @@ BACKBONES = {
             "alex", "alexnet-owt-7be5be79.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31
         ),
         Backbone("vgg", "vgg16-397923af.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
-        Backbone(
-            "squeeze",
-            "squeezenet1_1-b8a52dc0.pth",
-            (1, 4, 7, 9, 10, 11, 12),
-            (64, 128, 256, 384, 384, 512, 512),
-            17,
-        ),
     )
 }
-
-
-class Fire(nn.Module):
-    """SqueezeNet's block: a 1x1 convolution that narrows, then 1x1 and 3x3 side by side."""
-
-    def __init__(self, inputs: int, narrow: int, wide: int) -> None:
-        super().__init__()
-        self.squeeze = nn.Conv2d(inputs, narrow, 1)
-        self.expand1x1 = nn.Conv2d(narrow, wide, 1)
-        self.expand3x3 = nn.Conv2d(narrow, wide, 3, padding=1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Map (N, inputs, h, w) to (N, 2 wide, h, w)."""
-        x = self.squeeze(x).relu()
-        return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], dim=1)
 
 
 def features(name: str) -> nn.Sequential:
@@ -110,27 +88,6 @@ def features(name: str) -> nn.Sequential:
             for _ in range(count):
                 layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
                 inputs = outputs
-    elif name == "squeeze":
-
-        def pool() -> nn.Module:
-            return nn.MaxPool2d(3, 2, ceil_mode=True)
-
-        layers = [
-            nn.Conv2d(3, 64, 3, stride=2),
-            nn.ReLU(),
-            pool(),
-            Fire(64, 16, 64),
-            Fire(128, 16, 64),
-            pool(),
-        ]
-        layers += [
-            Fire(128, 32, 128),
-            Fire(256, 32, 128),
-            pool(),
-            Fire(256, 48, 192),
-            Fire(384, 48, 192),
-        ]
-        layers += [Fire(384, 64, 256), Fire(512, 64, 256)]
     else:
         raise ValueError(f"name: got {name!r}, expected one of {', '.join(BACKBONES)}")
     return nn.Sequential(*layers)
@@ -285,8 +242,8 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
 _HOW = (
     "Place there two files: the backbone's weights as torchvision publishes them ("
     + ", ".join(b.file for b in BACKBONES.values())
-    + ") and the file of linear layers of the lpips package, version 0.1 (alex.pth, vgg.pth or"
-    " squeeze.pth). Or name one file saved with torch.save(lpips.LPIPS(net='alex').state_dict(),"
+    + ") and the file of linear layers of the lpips package, version 0.1 (alex.pth or"
+    " vgg.pth). Or name one file saved with torch.save(lpips.LPIPS(net='alex').state_dict(),"
     " FILE) on a machine that has that package"
 )
 

@@ -121,31 +121,6 @@ def save_dino(folder, *, registers, seed=0):
     return model, processor
 
 
-class _Fire(nn.Module):
-    """SqueezeNet's block, put together from the paper and torchvision's names, for the oracle
-    alone.
-    """
-
-    def __init__(self, inputs, narrow, wide):
-        super().__init__()
-        self.squeeze = nn.Conv2d(inputs, narrow, kernel_size=1)
-        self.squeeze_activation = nn.ReLU()
-        self.expand1x1 = nn.Conv2d(narrow, wide, kernel_size=1)
-        self.expand1x1_activation = nn.ReLU()
-        self.expand3x3 = nn.Conv2d(narrow, wide, kernel_size=3, padding=1)
-        self.expand3x3_activation = nn.ReLU()
-
-    def forward(self, x):
-        x = self.squeeze_activation(self.squeeze(x))
-        return torch.cat(
-            [
-                self.expand1x1_activation(self.expand1x1(x)),
-                self.expand3x3_activation(self.expand3x3(x)),
-            ],
-            1,
-        )
-
-
 def torchvision_features(name):
     """``torchvision.models.<name>().features`` layer by layer, spelt out, pools and all."""
     C, R = nn.Conv2d, nn.ReLU
@@ -165,52 +140,16 @@ def torchvision_features(name):
             R(),
             nn.MaxPool2d(kernel_size=3, stride=2),
         )
-    if name == "vgg16":
-        layers, inputs = [], 3
-        for v in [
-            64,
-            64,
-            "M",
-            128,
-            128,
-            "M",
-            256,
-            256,
-            256,
-            "M",
-            512,
-            512,
-            512,
-            "M",
-            512,
-            512,
-            512,
-            "M",
-        ]:
-            if v == "M":
-                layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
-            else:
-                layers += [C(inputs, v, kernel_size=3, padding=1), R()]
-                inputs = v
-        return nn.Sequential(*layers)
-    return nn.Sequential(
-        C(3, 64, kernel_size=3, stride=2),
-        R(),
-        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(64, 16, 64),
-        _Fire(128, 16, 64),
-        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(128, 32, 128),
-        _Fire(256, 32, 128),
-        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(256, 48, 192),
-        _Fire(384, 48, 192),
-        _Fire(384, 64, 256),
-        _Fire(512, 64, 256),
-    )
+    layers, inputs = [], 3
+    for outputs, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(count):
+            layers += [C(inputs, outputs, kernel_size=3, padding=1), R()]
+            inputs = outputs
+        layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
+    return nn.Sequential(*layers)
 
 
-TORCHVISION = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}
+TORCHVISION = {"alex": "alexnet", "vgg": "vgg16"}
 
 
 def save_backbone(path, name, seed=0):

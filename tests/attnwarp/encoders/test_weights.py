@@ -37,8 +37,8 @@ def test_objects_that_could_run_code_are_refused_without_advice_to_run_them(tmp_
 @pytest.mark.door
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.99])
 def test_a_cut_file_of_lpips_is_named(kept, tmp_path):
-    path = tmp_path / BACKBONES["squeeze"].file
-    save_backbone(path, "squeeze")
+    path = tmp_path / BACKBONES["alex"].file
+    save_backbone(path, "alex")
     data = path.read_bytes()
     path.write_bytes(data[: int(kept * len(data))])
     with pytest.raises(InputError, match=f"{path.name}: cannot be read as weights"):

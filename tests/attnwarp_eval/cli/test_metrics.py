@@ -35,9 +35,9 @@ def models(tmp_path_factory):
         (folder / name).mkdir()
     tiny_models.save_clip(folder / "clip")
     tiny_models.save_dino(folder / "dino", registers=True)
-    tiny_models.save_backbone(folder / "lpips" / "squeezenet1_1-b8a52dc0.pth", "squeeze")
-    linear = tiny_models.linear_layers() / "squeeze.pth"
-    (folder / "lpips" / "squeeze.pth").write_bytes(linear.read_bytes())
+    tiny_models.save_backbone(folder / "lpips" / "alexnet-owt-7be5be79.pth", "alex")
+    linear = tiny_models.linear_layers() / "alex.pth"
+    (folder / "lpips" / "alex.pth").write_bytes(linear.read_bytes())
     return {
         "clip": f"clip:{folder / 'clip'}",
         "dino": f"dinov2:{folder / 'dino'}",
