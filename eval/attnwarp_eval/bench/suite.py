@@ -22,10 +22,8 @@ from attnwarp.errors import InputError
 from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp.io.file import inside
 from attnwarp.io.lock import alone_in
-from attnwarp.process import core_count
-from attnwarp.reporting import SILENT, Part, Reporter, duration
+from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.canonical_json import read_as
-from attnwarp_eval.drawn.asked import BRIGHT
 from attnwarp_eval.drawn.draft import GENERATOR
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
@@ -47,9 +45,6 @@ YAWS = (10, 30, 45, 60, 90, 120, 150, 180, -150, -120, -90, -60, -45, -30, -10)
 POINTS = 5000
 SPLATS = {"kind": "2d", "count": 16_000, "position_noise": 0.1, "normal_noise": 3.0}
 """Splats sampled on the surfaces, as in the studies."""
-
-SECONDS = {"scene": 10.0, "sample": 1.9e-6}
-"""CPU seconds of an export: a scene's shapes and splats, a path of its pictures."""
 
 LISTING = "truth/files.json"
 
@@ -197,12 +192,9 @@ def export(
     views: tuple[str, ...] = ()
     with alone_in(folder):
         written = {name: _written(folder, name, asked) for name in scenes}
-        left = [name for name in scenes if not written[name]]
-        time = duration(len(left) * _cost(size, spp, targets + 1) / core_count())
-        report.log(f"{len(left)} scenes to write: {time}, if {core_count()} cores are free")
         for number, name in enumerate(scenes):
             report.step(number, count, name)
-            if name in left:
+            if not written[name]:
                 part = Part(report, number, count)
                 written[name] = _write_scene(folder, name, number, asked, part)
             files |= written[name]
@@ -231,12 +223,6 @@ def _changed(folder: Path, files: Mapping[str, str]) -> Path | None:
     """First file that is lost or changed."""
     paths = {inside(folder, name): digest for name, digest in files.items()}
     return next((p for p, digest in paths.items() if not p.is_file() or sha256(p) != digest), None)
-
-
-def _cost(size: int, spp: int, views: int) -> float:
-    """CPU seconds of a scene: a picture before the edits, and one for each right answer."""
-    samples = size**2 * spp * views * (1 + 1 + len(BRIGHT))
-    return SECONDS["scene"] + SECONDS["sample"] * samples
 
 
 def truth_file(folder: Path, scene: str) -> Path:
