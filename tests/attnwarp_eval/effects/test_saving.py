@@ -1,4 +1,4 @@
-"""What a plan saves: ratios of planted seconds and noise, and intervals of scipy."""
+"""Savings of a plan: ratios of planted seconds and noise, and intervals of scipy."""
 
 import numpy as np
 import pytest
