@@ -1,5 +1,5 @@
-"""LPIPS from local weights: a torchvision backbone (AlexNet, VGG16, SqueezeNet 1.1) and the
-published linear layers.
+"""LPIPS from local weights: a torchvision backbone (AlexNet or VGG16) and the published
+linear layers.
 
 The networks are defined here, with torchvision's names of tensors, so torchvision need not be
 installed.
