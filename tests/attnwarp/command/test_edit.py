@@ -1,3 +1,4 @@
+# ruff: noqa: F811  (fixtures that are imported)
 """The command as a person runs it, on a small random editor in a folder; the oracle is the library and the files."""
 
 import json
@@ -22,10 +23,10 @@ import PIL.ImageOps
 import pytest
 import torch
 from further import further
+from loaded_once import editors_are_loaded_once, segmenter_folders, short_orbit  # noqa: F401
 from skimage.color import deltaE_ciede2000, rgb2lab
 from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
-from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians
@@ -254,17 +255,17 @@ def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     assert np.array_equal(source[:, 16:], original[:, 16:])
 
 
-def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(place, tmp_path):
+def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(
+    place, segmenter_folders, tmp_path
+):
     """Oracle: SAM and Grounding DINO called directly, and the same edit with ``--mask``."""
-    save_dino(tmp_path / "dino")
-    save_sam(tmp_path / "sam", seed=2)
     ply = ("--ply", place / "splats.ply")
-    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    segmenter = ("--segmenter", ",".join(map(str, segmenter_folders)))
     result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter, *ONE)
     assert result.exit_code == 0, result.output
     (made,) = (tmp_path / "words" / "words").rglob("*.png")
     source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
-    direct = GroundedSam.from_folders(tmp_path / "dino", tmp_path / "sam")
+    direct = GroundedSam.from_folders(*segmenter_folders)
     assert np.array_equal(read_image(made)[..., 0] > 127, direct.segment(source, "bear"))
     result = run(place, tmp_path / "file", *ply, "--mask", made, *ONE)
     assert result.exit_code == 0, result.output
@@ -716,11 +717,13 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     assert "in place of" not in result.stderr
 
 
-def test_a_mask_by_words_is_made_once_and_others_write_over_none(place, tmp_path, monkeypatch):
+def test_a_mask_by_words_is_made_once_and_others_write_over_none(
+    place, segmenter_folders, tmp_path, monkeypatch
+):
     """Oracle: the segmenter itself, and how often it is loaded."""
     camera = cameras()[0]
     image = read_image(place / "data" / "images" / camera.name)
-    segmenter, loaded = tiny_segmenter(tmp_path), []
+    segmenter, loaded = GroundedSam.from_folders(*segmenter_folders), []
     monkeypatch.setattr(
         "attnwarp.command.marks.load_segmenter",
         lambda name, *, device: loaded.append(name) or segmenter,
@@ -737,12 +740,6 @@ def test_a_mask_by_words_is_made_once_and_others_write_over_none(place, tmp_path
         mask_by_words(marks, camera, image, out, "cpu")
     mask_by_words(bear, camera, image[:, ::-1].copy(), out, "cpu")
     assert len(loaded) == len(list((out / "words").iterdir())) == 5
-
-
-def tiny_segmenter(folder):
-    save_dino(folder / "dino")
-    save_sam(folder / "sam", seed=2)
-    return GroundedSam.from_folders(folder / "dino", folder / "sam")
 
 
 def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
