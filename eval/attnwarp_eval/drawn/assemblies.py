@@ -489,7 +489,7 @@ def pieces(kind: str, instance: int) -> Pieces:
 
     Example:
         >>> list(pieces("mushroom", 3))
-        ['stem', 'cap']
+        ['cap', 'stem']
     """
     rng = np.random.default_rng([instance, *b"parts", *kind.encode()])
     return RECIPES[kind](Dice(rng))
