@@ -7,7 +7,6 @@ import ctypes
 import gc
 import os
 import signal
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -62,6 +61,8 @@ def kernel_folders(name: str) -> Iterator[Path]:
     Files there are executed, so a folder is skipped if another user may have created it, or a
     parent between it and the temporary folder.
     """
+    import tempfile
+
     folders = [cache_dir() / name]
     with suppress(FileNotFoundError):  # no temporary folder either
         folders.append(Path(tempfile.gettempdir()) / f"attnwarp-{os.getuid()}-{name}")

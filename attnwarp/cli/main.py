@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import typer
-
 from attnwarp.cli import shell
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
@@ -14,9 +12,8 @@ from attnwarp.cli.options import program_options
 from attnwarp.cli.poses import poses
 from attnwarp.cli.render import render
 
-app = typer.Typer(
+app = shell.App(
     name="attnwarp",
-    cls=shell.Program,
     help=(
         "Gaussian splats for consistent 3D scene editing: fit them to pictures, edit, render and"
         " convert them."
@@ -27,7 +24,6 @@ app = typer.Typer(
     ),
     no_args_is_help=True,
     add_completion=False,
-    pretty_exceptions_enable=False,
 )
 
 app.callback()(program_options)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from attnwarp import process
 from attnwarp.cli.entry import STOPPED
@@ -170,15 +170,45 @@ COMMANDS = {
 """Commands available in only one of the two programs."""
 
 
-def _show_no_type_of_flags(params: list[Any]) -> list[Any]:
-    """Help of a flag would show the type <bool>, though it takes no value."""
-    for param in params:
-        if getattr(param, "is_flag", False):
-            param.metavar = ""
-    return params
+class _Plain:
+    """Help in plain text with a section for each panel. Typer would draw it by rich, whose import
+    takes as long as all else that answers ``--help``.
+    """
+
+    def get_params(self: Any, ctx: Any) -> list[Any]:
+        """Return the options, flags without the type <bool>, since they take no value."""
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+            if param.name in ("help", "install_completion", "show_completion"):
+                param.default = False  # typer would import pydantic to read None
+        return params
+
+    def format_options(self: Any, ctx: Any, formatter: Any) -> None:
+        """Write the sections of arguments, options and commands."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            panel = "Arguments" if param.param_type_name == "argument" else "Options"
+            row = param.get_help_record(ctx)
+            if row is not None:
+                sections.setdefault(getattr(param, "rich_help_panel", None) or panel, []).append(
+                    row
+                )
+        for name, command in getattr(self, "commands", {}).items():
+            if not command.hidden:
+                first, *_ = (command.help or "").split("\n\n")
+                sections.setdefault(command.rich_help_panel or "Commands", []).append((name, first))
+        for name, rows in sections.items():
+            with formatter.section(name):
+                formatter.write_dl(rows)
 
 
-class Program(TyperGroup):
+class Command(_Plain, TyperCommand):
+    """A command of a program."""
+
+
+class Program(_Plain, TyperGroup):
     """Commands of a program; a command of the other program gets a hint."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -186,14 +216,7 @@ class Program(TyperGroup):
         for name, commands in COMMANDS.items():
             if args[0] in commands and args[0] not in self.commands:
                 raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
-        resolved = super().resolve_command(ctx, args)
-        if resolved[1]:
-            _show_no_type_of_flags(resolved[1].get_params(ctx))
-        return resolved
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Return the options of the program itself."""
-        return _show_no_type_of_flags(super().get_params(ctx))
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the named command; a refused choice is told without pydantic's first words."""
@@ -202,6 +225,17 @@ class Program(TyperGroup):
         except typer.BadParameter as error:
             error.message = error.message.removeprefix("Value error, ")
             raise
+
+
+class App(typer.Typer):
+    """Commands by name, whose help is plain text."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(cls=Program, rich_markup_mode=None, pretty_exceptions_enable=False, **more)
+
+    def command(self, name: str | None = None, **more: Any) -> Any:
+        """Decorate the function of a command."""
+        return super().command(name, cls=Command, **more)
 
 
 def use_threads(threads: int | None) -> None:

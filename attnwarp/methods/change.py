@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from attnwarp.colors import ciede2000, to_lab
-from attnwarp.drift import Drift, NoDrift, drift_or_why
 from attnwarp.methods.pictures import Bytes, Image, Mask, resized, to_bytes
 from attnwarp.methods.work import Work
 
@@ -134,6 +133,8 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any]:
         touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
         left = resized(touched, size)[..., 0] == 0
     before = to_bytes(resized(work.views.picture(view), size))
+    from attnwarp.drift import drift_or_why
+
     return asdict(drift_or_why(before, to_bytes(picture), left))
 
 
@@ -145,6 +146,8 @@ def say_drift(edit: Mapping[str, Any]) -> tuple[str, bool]:
     if told is None or told.get("why"):  # runs before the reason was kept have none
         why = f": {told['why']}" if told else ""
         return f"whether the edit of {edit['view']} moved the picture can't be told{why}", False
+    from attnwarp.drift import Drift, NoDrift
+
     found = Drift(**told) if "right" in told else NoDrift(**told)
     if isinstance(found, Drift) and not found.seen:
         return f"the edit of {edit['view']} left the picture in place ({found})", False

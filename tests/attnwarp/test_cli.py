@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 import attnwarp_eval.cli.main
 from attnwarp import Camera, Gaussians, reporting
 from attnwarp.cli.main import app
+from attnwarp.cli.options import PANELS
 from attnwarp.cli.shell import COMMANDS, clear_errors
 from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
@@ -97,8 +98,35 @@ for name in names:
     assert CliRunner().invoke(app, [name, "--help"]).exit_code == 0
 """
     heavy = {"torch", "numba", "numpy", "cv2", "scipy", "diffusers", "transformers"}
+    heavy |= {"rich", "pydantic"}
     modules = modules_after(code)
     assert "attnwarp.cli.main" in modules and not modules & heavy
+
+
+@pytest.mark.parametrize("program", ["attnwarp", "attnwarp_eval"])
+def test_the_help_of_a_program_and_a_mistyped_option_import_nothing_heavy(program):
+    command = "edit bear" if program == "attnwarp" else "run quick"
+    code = f"""
+from typer.testing import CliRunner
+from {program}.cli.main import app
+assert CliRunner().invoke(app, ["--help"]).exit_code == 0
+done = CliRunner().invoke(app, {command.split()!r} + ["--stepz", "3"])
+assert done.exit_code == 2 and "No such option: --stepz" in done.stderr
+"""
+    assert not modules_after(code) & {"torch", "numpy", "cv2", "rich", "pydantic"}
+
+
+@pytest.mark.parametrize("package", ["methods", "fit", "render"])
+def test_the_packages_import_neither_compilers_nor_pictures_nor_networks(package):
+    modules = modules_after(f"import attnwarp.{package}")
+    assert f"attnwarp.{package}" in modules
+    assert not modules & {"torch._dynamo", "diffusers", "transformers", "cv2", "numba", "scipy"}
+
+
+def test_the_help_has_a_section_for_each_panel_in_order():
+    text = CliRunner().invoke(app, ["edit", "--help"]).stdout
+    sections = re.findall(r"^(\w.*):$", text, re.M)
+    assert sections == ["Arguments", "Options", *PANELS]
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,11 @@ from typing import Annotated
 
 import typer
 
-from attnwarp.cli.shell import Program
+from attnwarp.cli.shell import App
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import clear_errors, resumable
 
-app = typer.Typer(
-    cls=Program,
+app = App(
     help="A bench for methods that live elsewhere: scenes as files, and scores.",
     no_args_is_help=True,
 )

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import typer
 
-from attnwarp.cli.shell import Program
+from attnwarp.cli.shell import App
 from attnwarp_eval.cli.shell import clear_errors
 
-app = typer.Typer(
-    cls=Program,
+app = App(
     help="Derived files (meshes, true pictures, splats), kept to save time.",
     no_args_is_help=True,
 )

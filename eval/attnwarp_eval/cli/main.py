@@ -24,9 +24,8 @@ from attnwarp_eval.cli import (
     tracks,
 )
 
-app = typer.Typer(
+app = shell.App(
     name="attnwarp-eval",
-    cls=shell.Program,
     help=(
         "Check warps, masks and depth of Gaussian scenes against exact truth, and report what"
         " accuracy costs in time."
@@ -36,7 +35,6 @@ app = typer.Typer(
         " measured; 130 stopped by Ctrl-C or kill, 141 output pipe closed."
     ),
     no_args_is_help=True,
-    pretty_exceptions_enable=False,
 )
 
 STUDIES, PICTURES, MACHINE = (

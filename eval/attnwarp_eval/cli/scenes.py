@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from attnwarp.cli.options import option
-from attnwarp.cli.shell import Program, fail, log
+from attnwarp.cli.shell import App, fail, log
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene
 
-app = typer.Typer(
-    cls=Program,
+app = App(
     help="The scenes whose truth is known: list them, read one, look at one.",
     no_args_is_help=True,
 )

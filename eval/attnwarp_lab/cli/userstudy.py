@@ -8,11 +8,10 @@ from typing import Annotated
 import typer
 
 from attnwarp.cli.options import option
-from attnwarp.cli.shell import Program, fail
+from attnwarp.cli.shell import App, fail
 from attnwarp_eval.cli.shell import TOO_LITTLE, check_not_of_run, clear_errors, names
 
-app = typer.Typer(
-    cls=Program,
+app = App(
     help="Ask people which edited scene they prefer, and score their answers.",
     no_args_is_help=True,
 )
