@@ -4,10 +4,14 @@ import subprocess
 import sys
 
 
-def modules_after(code):
-    """Names in ``sys.modules`` at the end of ``code``, which prints nothing."""
-    program = f"{code}\nimport sys\nprint('\\n'.join(sys.modules))"
+def modules_after(code, *further):
+    """Names in ``sys.modules`` at the end of ``code``, which prints nothing; of several pieces, a
+    set after each of them, from one process.
+    """
+    pieces = (code, *further)
+    program = "\n".join(f"{piece}\nimport sys\nprint(*sys.modules)" for piece in pieces)
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True
     )
-    return set(done.stdout.split())
+    sets = [set(line.split()) for line in done.stdout.splitlines()]
+    return sets if further else sets[0]

@@ -153,12 +153,9 @@ def test_a_picture_and_its_mirror_image_say_the_same(clip):
 
 
 def test_things_colours_and_times_are_named(clip, worlds):
-    figures = {
-        f.what: f
-        for f in assess.clip_figures(
-            clip, dict.fromkeys(("test", "test-new-pairs", "test-rendered"), worlds)
-        )
-    }
+    few = Pictures(*(column[:6] for column in vars(worlds).values()))  # not looked at
+    sets = {"test": worlds, "test-new-pairs": few, "test-rendered": few}
+    figures = {f.what: f for f in assess.clip_figures(clip, sets)}
     # 72 pictures of 12 worlds that the cards' figures do not know: what was asked of the encoder
     # must lie within their interval.
     asked = {

@@ -165,9 +165,13 @@ def test_normals_lie_where_their_depth_does() -> None:
     assert normal.shape == (view.height, view.width, 3)
 
 
-def test_importing_the_door_loads_neither_numba_nor_warp() -> None:
-    modules = modules_after("import attnwarp.render")
-    assert "attnwarp.render" in modules and not modules & {"numba", "warp", "scipy"}
+def test_importing_the_door_loads_neither_numba_nor_warp_and_nobody_loads_warp_unasked() -> None:
+    door, everything = modules_after(
+        "import attnwarp.render",
+        "import attnwarp.fit, attnwarp.warp, attnwarp.methods, attnwarp.cli.main",
+    )
+    assert "attnwarp.render" in door and not door & {"numba", "warp", "scipy"}
+    assert "attnwarp.methods" in everything and "warp" not in everything
 
 
 @pytest.mark.door

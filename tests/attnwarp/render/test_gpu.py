@@ -7,7 +7,6 @@ import dataclasses
 
 import pytest
 import torch
-from imported_modules import modules_after
 from rounding import excess, maps_and_gradients, prepared
 
 from attnwarp.render import render
@@ -20,11 +19,6 @@ def test_a_picture_agrees_with_the_definition(make_camera, make_splats) -> None:
         max(excess(prepared(make_splats(7, "2d", 20, camera), camera), backend="gpu").values())
         < 1e-5
     )
-
-
-def test_warp_is_imported_by_nobody_who_does_not_ask_for_it() -> None:
-    program = "import attnwarp.fit, attnwarp.warp, attnwarp.methods, attnwarp.cli.main"
-    assert "warp" not in modules_after(program)
 
 
 @pytest.mark.slow
