@@ -13,6 +13,7 @@ from attnwarp.io.lock import alone_in
 from attnwarp_eval.bench import EDITORS, result, run, score, suite
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.plugins import load_plugins
+from attnwarp_eval.truth.mitsuba import build
 
 REPORTS = Path(__file__).parents[3] / "reports" / "bench"
 BENCH = {"generator": 1, "seed": 31, "size": 64, "spp": 4, "views": ["source"]}
@@ -131,7 +132,8 @@ def test_warps_stand_in_a_table_of_their_own_behind_it_those_without_all_scenes(
         read(tmp_path, data)
 
 
-def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
+def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "TEXELS", 128)
     load_plugins()
     assert "ideal" in EDITORS
     bench, out = tmp_path / "bench", tmp_path / "out"
