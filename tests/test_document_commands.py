@@ -5,6 +5,7 @@ cheap ones run.
 """
 
 import argparse
+import functools
 import importlib
 import itertools
 import re
@@ -31,6 +32,7 @@ PAGES = [
     *sorted(f"{path.relative_to(ROOT)}" for path in (ROOT / "docs").rglob("*.md")),
 ]
 APPS = {"attnwarp": attnwarp.cli.main.app, "attnwarp-eval": attnwarp_eval.cli.main.app}
+COMMAND = functools.cache(typer.main.get_command)
 SHELLS = ("sh", "bash", "shell", "console")
 
 
@@ -56,7 +58,7 @@ def split(block):
 
 def parse(app, words, name):
     """Parse a command line down to its last subcommand, as the command does before it acts."""
-    command = typer.main.get_command(app) if isinstance(app, typer.Typer) else app
+    command = COMMAND(app) if isinstance(app, typer.Typer) else app
     context = command.make_context(name, list(words), resilient_parsing=False)
     while hasattr(command, "resolve_command"):  # a group; typer may bring a click of its own
         rest = [*context._protected_args, *context.args]

@@ -3,6 +3,7 @@ default device is no CPU, or whose gradients are off. The device meta stands for
 """
 
 import ast
+import functools
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -59,9 +60,9 @@ def methods_but_one_at_the_door():
         yield pytest.param(name, marks=[pytest.mark.door] * (name != "attention_warping"))
 
 
-@OTHER_PROCESSES
-@pytest.mark.parametrize("name", methods_but_one_at_the_door())
-def test_an_edit_has_the_same_bits_in_a_process_of_other_defaults(name, process):
+@functools.cache
+def edit_of(name):
+    """What edits by a method, and its edit in a process of torch's own defaults."""
     model, views = splats(), cameras(3)
     images = pictures(model, views)
     settings = preset(name, steps=2, iterations=3, background="random")
@@ -75,16 +76,22 @@ def test_an_edit_has_the_same_bits_in_a_process_of_other_defaults(name, process)
         editor = load_editor("small-depth" if name == "gaussctrl" else "small-plain")
         return METHODS[name](model, views, images, editor, "make it red", settings, **own)
 
-    first = edited()
+    return edited, edited()
+
+
+@OTHER_PROCESSES
+@pytest.mark.parametrize("name", methods_but_one_at_the_door())
+def test_an_edit_has_the_same_bits_in_a_process_of_other_defaults(name, process):
+    edited, first = edit_of(name)
     with process():
         again = edited()
     assert all(np.array_equal(again.edited[view], first.edited[view]) for view in first.edited)
     assert same_splats(again.gaussians, first.gaussians)
 
 
-@OTHER_PROCESSES
-@pytest.mark.parametrize("kind", ["2d", pytest.param("3d", marks=pytest.mark.door)])
-def test_a_fit_has_the_same_bits_in_a_process_of_other_defaults(kind, process):
+@functools.cache
+def fit_of(kind):
+    """What fits, and its fit in a process of torch's own defaults."""
     model, views = splats(), cameras()
     seen = Views(views, pictures(model, views))
     settings = FitSettings(
@@ -98,9 +105,16 @@ def test_a_fit_has_the_same_bits_in_a_process_of_other_defaults(kind, process):
         return fit(start, seen, settings).gaussians
 
     first = fitted()
+    assert len(first) > len(model)  # densified, which draws
+    return fitted, first
+
+
+@OTHER_PROCESSES
+@pytest.mark.parametrize("kind", ["2d", pytest.param("3d", marks=pytest.mark.door)])
+def test_a_fit_has_the_same_bits_in_a_process_of_other_defaults(kind, process):
+    fitted, first = fit_of(kind)
     with process():
         again = fitted()
-    assert len(first) > len(model)  # densified, which draws
     assert same_splats(again, first)
 
 

@@ -248,7 +248,7 @@ def test_a_world_far_from_its_origin_is_fitted_as_well():
     for offset in ((0.0, 0.0, 0.0), (1e6, -2e6, 5e5)):
         truth, cameras = blobs(offset=offset), ring(offset=np.array(offset))
         start = from_points(truth.world_means(), kind="2d", sh_degree=0)
-        settings = FitSettings(iterations=40, sh_degree=0, densify=False)
+        settings = FitSettings(iterations=20, sh_degree=0, densify=False)
         result = fit(
             start, pictures(truth, cameras[1:]), settings, held_out=pictures(truth, cameras[:1])
         )
@@ -299,7 +299,7 @@ def test_scaling_the_world_changes_nothing():
         images = [render(truth, c, near=near).color.clamp(0, 1).numpy() for c in moved]
         start = from_points(truth.world_means(), kind="2d", sh_degree=0)
         settings = FitSettings(
-            iterations=40, sh_degree=0, densify=False, normal_from=0, distortion_from=0
+            iterations=20, sh_degree=0, densify=False, normal_from=0, distortion_from=0
         )
         result = fit(
             start, Views(moved[1:], images[1:]), settings, held_out=Views(moved[:1], images[:1])
