@@ -67,7 +67,7 @@ def test_pictures_of_many_tiles_agree(
     if width == 300:
         # A row of bits holds 14 tiles: some splat must be wider.
         alone = [
-            render(splats.select(torch.tensor([k])), camera, backend="reference", **options)
+            render(splats.select(torch.tensor([k])), camera, backend=backend, **options)
             for k in range(0, 40, 4)
         ]
         assert max(int((view.alpha > 0).any(0).sum()) for view in alone) > 15 * constants.TILE
