@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from backends import GPU
-from imported_modules import modules_after
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import api, render
@@ -163,15 +162,6 @@ def test_normals_lie_where_their_depth_does() -> None:
     normal = api.normal_from_depth(depth, view)
     assert normal.device == depth.device
     assert normal.shape == (view.height, view.width, 3)
-
-
-def test_importing_the_door_loads_neither_numba_nor_warp_and_nobody_loads_warp_unasked() -> None:
-    door, everything = modules_after(
-        "import attnwarp.render",
-        "import attnwarp.fit, attnwarp.warp, attnwarp.methods, attnwarp.cli.main",
-    )
-    assert "attnwarp.render" in door and not door & {"numba", "warp", "scipy"}
-    assert "attnwarp.methods" in everything and "warp" not in everything
 
 
 @pytest.mark.door
