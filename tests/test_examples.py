@@ -13,6 +13,8 @@ import pytest
 import small_capture
 import torch
 
+from attnwarp_eval.truth.mitsuba import build
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = {
     "attnwarp": ROOT / "attnwarp",
@@ -86,6 +88,15 @@ def modules_with_examples():
             if ">>> " in path.read_text():
                 parts = path.relative_to(folder).with_suffix("").parts
                 yield ".".join((package, *parts)).removesuffix(".__init__")
+
+
+@pytest.fixture(scope="module")
+def coarse_textures():
+    """Textures for the examples' pictures of a few pixels, which print none of their values."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "TEXELS", 64)
+        yield
+        build.forget()
 
 
 @pytest.fixture

@@ -57,6 +57,7 @@ def drawing(
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     style: dict[Any, Any] = {
         "svg.hashsalt": "attnwarp",
@@ -84,7 +85,8 @@ def drawing(
         for each in axes.flat:
             _place_names(each)
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        # savefig would draw everything once more, for a layout that is done.
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
         pyplot.close(figure)
         write_atomic(path, _titled(buffer.getvalue().decode()).encode())
 
