@@ -20,6 +20,7 @@ import pytest
 import torch
 import yaml
 from imported_modules import modules_after
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from attnwarp.render.threads import set_thread_count
@@ -85,6 +86,8 @@ def folder(tmp_path_factory):
     environment.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        # Charts are laid out by the tests of charts; half of the CPU of these would be theirs.
+        patch.setattr(Figure, "draw_without_rendering", lambda figure: None)
         # A commit made while the tests run would change the revision that reports name.
         patch.setenv("GIT_DIR", "/nonexistent")
         yield folder
