@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+# `json.dumps` makes an encoder at each call: a quarter of the time of a network of small tensors.
+_ENCODE = json.JSONEncoder(sort_keys=True, default=str).encode
+
 
 def digest(*parts: Any) -> str:
     """Hash arrays, bytes and JSON values in sequence (SHA-256).
@@ -38,5 +41,5 @@ def digest_each(parts: Iterable[Any]) -> str:
         elif isinstance(part, bytes):
             total.update(part)
         else:
-            total.update(json.dumps(part, sort_keys=True, default=str).encode())
+            total.update(_ENCODE(part).encode())
     return total.hexdigest()
