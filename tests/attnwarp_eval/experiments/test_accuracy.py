@@ -14,6 +14,8 @@ from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
 from attnwarp_eval.scene.file import load_scene
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 
 def test_the_brute_force_finds_hits_known_in_closed_form():
     # A unit right triangle at z = 2 before one at z = 3: rays through the lower left half hit the

@@ -2,14 +2,24 @@ import pytest
 from torch_threads import on_one_thread
 
 from attnwarp_eval.inspect import subject
+from attnwarp_eval.truth.mitsuba import build
 
 
-@pytest.fixture(scope="session")
-def chosen():
+@pytest.fixture(autouse=True, scope="package")
+def few_texels():
+    """Textures for pictures of 64, not 512 rows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "TEXELS", 256)
+        yield
+        build.forget()
+
+
+@pytest.fixture(scope="package")
+def chosen(few_texels):
     return subject.of_scene("spheres", 64)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def pair(chosen):
     return chosen.pair("corrected", "yaw060")
 

@@ -193,29 +193,6 @@ def test_colours_of_the_rules_name_the_first_that_rejects(pair):
     assert np.allclose(image[left], (grey + 0.65 * pictures.rgb(ACCEPTED))[left], atol=1e-5)
 
 
-def test_the_covering_view_sees_the_surface_and_none_sees_it_straighter(pair):
-    """Against the exact relation of each view and the target, for the views that are drawn."""
-    from attnwarp_eval.truth import two_view
-
-    names = pair._covering_views()
-    camera = pair.cameras[1]
-    hits = pair.truth.hits
-    cosines = []
-    for name in names:
-        view = pair.views.camera(name)
-        relation = two_view(pair.views.geometry, view, camera)
-        ray = view.position - hits.point
-        cosine = np.einsum("hwi,hwi->hw", hits.normal, ray) / np.linalg.norm(ray, axis=-1)
-        cosines.append(np.where(relation.visible, cosine, -1))
-        unsure = relation.label == 3
-        cosines[-1][unsure] = np.nan
-    cosines = np.array(cosines)
-    sure = np.isfinite(cosines).all(axis=0) & hits.valid
-    expected = np.where(cosines.max(axis=0) > 0, cosines.argmax(axis=0), -1)
-    assert np.array_equal(pair.covering[sure], expected[sure])
-    assert len(np.unique(expected[sure])) > 3
-
-
 def test_a_report_can_name_the_command_that_opens_a_view():
     command = inspect_command("my runs/a", "bear", "it's; rm -rf", "yaw060", pixel="3,4")
     assert command == (

@@ -22,6 +22,8 @@ from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import StudyError, load_study
 from attnwarp_eval.truth import Geometry
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 STUDY = """
 name: small
 size: 32
@@ -184,7 +186,7 @@ def test_errors_of_a_picture_are_those_of_scikit_image():
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, coarse_textures):
     folder = tmp_path_factory.mktemp("fits")
     (folder / "small.yaml").write_text(STUDY)
     study = load_study(str(folder / "small.yaml"))
