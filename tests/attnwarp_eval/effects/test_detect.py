@@ -441,7 +441,8 @@ def test_a_lens_blurs_a_far_dot_over_its_circle_of_confusion():
         "shape": {"type": "sphere", "center": [0, 0, 0], "radius": 0.01},
         "emission": {"radiance": 1.0},
     }
-    camera = Camera.look_at((6, 0, 0), (0, 0, 0), width=64, height=64, fov_y=20)
+    # The middle of 64 px under 20 degrees, twice as wide as the circle.
+    camera = Camera.look_at((6, 0, 0), (0, 0, 0), width=24, height=24, fov_y=7.6)
     f, aperture = camera.K[0, 0], 0.2
 
     def spread(focus):
