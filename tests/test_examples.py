@@ -33,6 +33,7 @@ DOORS = [
     "attnwarp.methods",
     "attnwarp.render",
     "attnwarp.warp",
+    "attnwarp_eval.encoders",
     "attnwarp_eval.document.charts",
     "attnwarp_eval.document.model",
     "attnwarp_eval.document.numbers",

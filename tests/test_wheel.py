@@ -91,7 +91,7 @@ for module in pkgutil.walk_packages(attnwarp.__path__, "attnwarp."):
 print(attnwarp.__file__)
 heavy = {"mitsuba", "open3d", "pyvista", "distributed", "transformers", "diffusers"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
-from attnwarp.encoders import load_encoder
+from attnwarp_eval.encoders import load_encoder
 import numpy as np
 print(load_encoder("dino-small", "dino").images([np.zeros((64, 64, 3))]).shape)
 from attnwarp.editing.small import load_editor

@@ -60,7 +60,7 @@ class ImageEncoder(Protocol):
     Example:
         >>> import numpy as np
         >>> from attnwarp.encoders import ImageEncoder, load_encoder
-        >>> encoder = load_encoder("dino-small")
+        >>> encoder = load_encoder("clip-small")
         >>> isinstance(encoder, ImageEncoder), encoder.images([np.zeros((64, 96, 3))]).shape
         (True, (1, 192))
     """
@@ -130,23 +130,6 @@ class PlaceEncoder(Protocol):
 
 
 @runtime_checkable
-class TokenEncoder(ImageEncoder, Protocol):
-    """Encoder from pictures to embeddings and grids of patch embeddings, such as DINO.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp.encoders import TokenEncoder, load_encoder
-        >>> encoder = load_encoder("dino-small")
-        >>> isinstance(encoder, TokenEncoder), encoder.tokens([np.zeros((64, 64, 3))]).shape
-        (True, (1, 8, 8, 192))
-    """
-
-    def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """Embed the patches of preprocessed pictures, (N, h, w, D) float64, by row."""
-        ...
-
-
-@runtime_checkable
 class PerceptualDistance(Protocol):
     """Distance of pictures that follows human judgement, such as LPIPS.
 
@@ -180,7 +163,7 @@ class PerceptualDistance(Protocol):
         ...
 
 
-Encoder = ImageEncoder | TextImageEncoder | TokenEncoder | PerceptualDistance
+Encoder = ImageEncoder | TextImageEncoder | PerceptualDistance
 
 
 def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.NDArray[np.float32]]:

@@ -22,7 +22,7 @@ from attnwarp.encoders.base import (
     checked_pairs,
     checked_texts,
 )
-from attnwarp.encoders.nets import ClipParts, ClipSmall, DinoSmall, PerceptualSmall
+from attnwarp.encoders.nets import ClipParts, ClipSmall, PerceptualSmall
 from attnwarp.encoders.preprocess import Preprocessing, resize
 from attnwarp.errors import InputError, optional_imports
 
@@ -33,19 +33,19 @@ BATCH = 32
 Array = npt.NDArray[np.float64]
 
 
-def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | BundledPerceptual:
-    """Load a bundled encoder: "clip-small", "clip-parts", "dino-small" or "perceptual-small"."""
+def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledPerceptual:
+    """Load a bundled encoder: "clip-small", "clip-parts" or "perceptual-small"."""
     kinds: dict[str, Callable[[str, Path], Any]] = {
         "clip-small": BundledClip, "clip-parts": BundledClipParts,
-        "dino-small": BundledDino, "perceptual-small": BundledPerceptual,
+        "perceptual-small": BundledPerceptual,
     }  # fmt: skip
     if name not in kinds:
         raise InputError(f"encoder {name!r}: not bundled, expected one of {', '.join(kinds)}")
-    encoder: BundledClip | BundledDino | BundledPerceptual = kinds[name](name, folder)
+    encoder: BundledClip | BundledPerceptual = kinds[name](name, folder)
     return encoder
 
 
-def _info(
+def identity_of(
     name: str,
     kind: Kind,
     files: Sequence[Path],
@@ -53,6 +53,7 @@ def _info(
     size: int | None,
     dim: int | None,
 ) -> EncoderInfo:
+    """Identify a bundled encoder by its files; InputError if its card names other weights."""
     sha256 = sha256_of(files)
     card = files[0].with_name(f"{name}.md")
     # A changed weight is undetectable by itself; the card's hash identifies the trained weights.
@@ -64,7 +65,7 @@ def _info(
     return EncoderInfo(name, kind, "bundled", sha256, preprocessing, size, dim)
 
 
-def _read(net: torch.nn.Module, path: Path) -> None:
+def read_weights(net: torch.nn.Module, path: Path) -> None:
     """Load weights, stored in half precision, into a network in single precision on the CPU."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -84,13 +85,13 @@ def _read(net: torch.nn.Module, path: Path) -> None:
     net.eval().requires_grad_(False)
 
 
-class _OfSquares:
+class OfSquares:
     """Base of the encoders with square input: preprocessing in batches."""
 
     about: EncoderInfo
     preprocess: Preprocessing
 
-    def _rows(
+    def rows(
         self,
         images: Sequence[Image],
         network: Callable[[torch.Tensor], torch.Tensor],
@@ -106,7 +107,7 @@ class _OfSquares:
         return np.concatenate(rows) if rows else np.zeros((0, *shape))
 
 
-class BundledClip(_OfSquares):
+class BundledClip(OfSquares):
     """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`."""
 
     network: type[ClipSmall] = ClipSmall
@@ -125,13 +126,13 @@ class BundledClip(_OfSquares):
         self.tokenizer = Tokenizer.from_file(str(vocabulary_file))
         self.net = self.network(self.tokenizer.get_vocab_size())
         weights = folder / f"{name}.safetensors"
-        _read(self.net, weights)
+        read_weights(self.net, weights)
         self.preprocess = Preprocessing(
             resize=ClipSmall.size, crop=(ClipSmall.size, ClipSmall.size)
         )
         dim = self.net.pool.project.out_features
         description = f"{self.preprocess}; mean of the picture's embedding and its mirror image's"
-        self.about = _info(
+        self.about = identity_of(
             name, "clip", [weights, vocabulary_file], description, ClipSmall.size, dim
         )
 
@@ -145,7 +146,7 @@ class BundledClip(_OfSquares):
         def mean(batch: torch.Tensor) -> torch.Tensor:
             return 0.5 * (self.net.images(batch) + self.net.images(batch.flip(-1)))
 
-        return self._rows(images, mean, (self.about.dim or 0,))
+        return self.rows(images, mean, (self.about.dim or 0,))
 
     def cut(self, text: str) -> int:
         """Count a text's tokens beyond the network's length, which are dropped."""
@@ -187,32 +188,6 @@ class BundledClipParts(BundledClip):
         return torch.sigmoid(patches.scale.double().exp() * cosines + patches.bias.double()).numpy()
 
 
-class BundledDino(_OfSquares):
-    """dino-small: a :class:`~attnwarp.encoders.base.TokenEncoder`."""
-
-    def __init__(self, name: str, folder: Path) -> None:
-        self.net = DinoSmall()
-        weights = folder / f"{name}.safetensors"
-        _read(self.net, weights)
-        self.preprocess = Preprocessing(
-            resize=DinoSmall.size, crop=(DinoSmall.size, DinoSmall.size)
-        )
-        self.about = _info(
-            name, "dino", [weights], str(self.preprocess), DinoSmall.size, self.net.dim
-        )
-
-    def images(self, images: Sequence[Image]) -> Array:
-        """Compute class tokens, (N, D) float64, not normalised."""
-        return self._rows(images, lambda batch: self.net(batch)[0], (self.net.dim,))
-
-    def tokens(self, images: Sequence[Image]) -> Array:
-        """Compute patch tokens of the central square, (N, 8, 8, D) float64; a patch has 16 x 16 of
-        128 x 128 px."""
-        side = DinoSmall.size // DinoSmall.patch
-        shape = side, side, self.net.dim
-        return self._rows(images, lambda batch: self.net(batch)[1].permute(0, 2, 3, 1), shape)
-
-
 class BundledPerceptual:
     """perceptual-small: a :class:`~attnwarp.encoders.base.PerceptualDistance`.
 
@@ -225,8 +200,10 @@ class BundledPerceptual:
     def __init__(self, name: str, folder: Path) -> None:
         self.net = PerceptualSmall()
         weights = folder / f"{name}.safetensors"
-        _read(self.net, weights)
-        self.about = _info(name, "perceptual", [weights], "as it is, at its own size", None, None)
+        read_weights(self.net, weights)
+        self.about = identity_of(
+            name, "perceptual", [weights], "as it is, at its own size", None, None
+        )
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> Array:
         """Compute distances, (N,) float64, 0 for equal pictures; about (strength of the

@@ -203,42 +203,6 @@ class ClipParts(ClipSmall):
         return self.patches(self.vision(x)[1:])
 
 
-class DinoSmall(nn.Module):
-    """Small network: convolutions to 1/16 of the size, then a transformer with a class token (Caron
-    et al. 2021).
-
-    The convolutions replace the patch embedding, since a transformer alone needs far more
-    pictures. The class token starts as mean and maximum of their features.
-    """
-
-    size = 128
-    patch = 16
-
-    def __init__(self, dim: int = 192, depth: int = 3, heads: int = 6) -> None:
-        super().__init__()
-        self.dim = dim
-        self.stages = Stages((32, 64, 128), (1, 2, 2))
-        self.embed = nn.Conv2d(128, dim, 1)
-        self.cls = Pool(128, dim)
-        self.position = nn.Parameter(0.02 * torch.randn(1, dim, 8, 8))
-        self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map (N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens
-        (N, D, H / 16, W / 16).
-        """
-        x = self.stages(x)[-1]
-        y = self.embed(x)
-        h, w = y.shape[-2:]
-        y = y + functional.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
-        tokens = torch.cat([self.cls(x)[:, None], y.flatten(2).transpose(1, 2)], dim=1)
-        for block in self.blocks:
-            tokens = block(tokens)
-        tokens = self.norm(tokens)
-        return tokens[:, 0], tokens[:, 1:].transpose(1, 2).reshape(len(y), self.dim, h, w)
-
-
 class PerceptualSmall(nn.Module):
     """Small network: differences of features, weighted by channel and averaged over positions and
     stages (Zhang et al. 2018, eq. 1).

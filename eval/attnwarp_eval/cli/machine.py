@@ -195,7 +195,7 @@ def weights() -> Check:
     """The bundled encoders and editors, against their checksums."""
     program = """
 from attnwarp.editing import small
-from attnwarp.encoders import BUNDLED, load_encoder
+from attnwarp_eval.encoders import BUNDLED, load_encoder
 for name in small.bundled():
     small.check_sums(small.WEIGHTS / name)
 for name in BUNDLED:

@@ -200,7 +200,7 @@ def encoders(
     Some ship with the package, others are read from a folder of yours.
     """
     with clear_errors():
-        from attnwarp.encoders import BUNDLED, REAL, load_encoder
+        from attnwarp_eval.encoders import BUNDLED, REAL, load_encoder
 
         if name is not None:
             about = load_encoder(name).about.to_dict()

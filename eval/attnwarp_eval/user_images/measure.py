@@ -20,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.devices import device_of
-from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
+from attnwarp.encoders import EncoderInfo, Kind
 from attnwarp.errors import InputError
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.encoders import check_kind, load_encoder
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
@@ -195,13 +196,14 @@ def measure(
     """Compute every figure of the paper's table that the pictures and prompts allow.
 
     Args:
-        encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
+        encoders: kind -> name, see :func:`attnwarp_eval.encoders.load_encoder`; "none" leaves its
             figures out. A missing kind, or None, takes the bundled one, and its figures are left
             out if there is none.
         store: cache of finished batches, so that an interrupted call is resumed. Views are
             identified by the content of their files.
         device: "cpu" or "cuda", for real encoders.
-        load: function that loads an encoder, in place of :func:`attnwarp.encoders.load_encoder`.
+        load: function that loads an encoder, in place of
+            :func:`attnwarp_eval.encoders.load_encoder`.
 
     Raises:
         InputError: nothing can be computed (the message gives the reason for each figure), a

@@ -27,7 +27,7 @@ from attnwarp.editing.small import (
     own_steps_of,
     thread_count,
 )
-from attnwarp.encoders import Kind, load_encoder
+from attnwarp.encoders import Kind
 from attnwarp.errors import InputError
 from attnwarp.fit.views import to_float
 from attnwarp.gaussians import Gaussians
@@ -39,6 +39,7 @@ from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.encoders import load_encoder
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.record import Json

@@ -169,8 +169,8 @@ class Loaded:
         return _from(self.folder, self.manifest.editors[name])
 
     def encoder(self, kind: Literal["clip", "dino", "perceptual"]) -> str:
-        """An encoder as :func:`attnwarp.encoders.load_encoder` takes it."""
-        from attnwarp.encoders import BUNDLED
+        """An encoder as :func:`attnwarp_eval.encoders.load_encoder` takes it."""
+        from attnwarp_eval.encoders import BUNDLED
 
         folder = str(getattr(self.manifest.encoders, kind))
         return folder if folder in BUNDLED else f"{AUTHORS[kind]}:{self.path(folder)}"

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.encoders.base import Image, PerceptualDistance, TextImageEncoder, TokenEncoder
+from attnwarp.encoders.base import Image, PerceptualDistance, TextImageEncoder
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, HOURS, OBJECTS, PLACES, TIMES
+from attnwarp_eval.encoders import TokenEncoder
 from training.encoders.clip import true_of
 from training.encoders.distort import HELD_OUT_KINDS, TRAIN_KINDS
 from training.encoders.perceptual import HELD_OUT_PHOTOS, Sources, photographs, triple

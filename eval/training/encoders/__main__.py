@@ -17,11 +17,12 @@ Data = Annotated[
     Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")
 ]
 Out = Annotated[Path, typer.Option(help="Folder of checkpoints; training goes on from them.")]
-Weights = Annotated[Path, typer.Option(help="Folder that gets weights and cards.")]
+Weights = Annotated[
+    Path | None, typer.Option(help="Folder that gets weights and cards; else the package's.")
+]
 Threads = Annotated[int, typer.Option(min=1, help="Of training and rendering.")]
 
 DATA, OUT = Path("../runs/encoders/data"), Path("../runs/encoders")
-WEIGHTS = Path(__file__).parents[3] / "attnwarp" / "encoders" / "weights"
 NAMES = ("clip-small", "clip-parts", "dino-small", "perceptual-small")
 
 
@@ -47,7 +48,7 @@ def train(name: str, data: Data = DATA, out: Out = OUT, threads: Threads = 2) ->
 
 
 @app.command()
-def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
+def export(name: str, out: Out = OUT, weights: Weights = None) -> None:
     """Write a trained encoder's weights in half precision, as the package carries them."""
     import shutil
 
@@ -62,6 +63,7 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
         }
     else:
         net = state["model"]
+    weights = weights or _package_folder(name)
     weights.mkdir(parents=True, exist_ok=True)
     half = {k: v.half().contiguous() if v.is_floating_point() else v for k, v in net.items()}
     save_file(half, weights / f"{name}.safetensors")
@@ -77,7 +79,7 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
 
 @app.command()
 def assess(
-    name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2
+    name: str, data: Data = DATA, out: Out = OUT, weights: Weights = None, threads: Threads = 2
 ) -> None:
     """Measure an encoder on unseen data, and write its card; the checkpoint, if there is
     one, says how long training took.
@@ -85,13 +87,13 @@ def assess(
     import torch
 
     import training.assess.figures
-    from attnwarp.encoders.bundled import load
     from training.assess.parts import part_figures
     from training.encoders.cards import card
     from training.worlds import part_pictures
 
     torch.set_num_threads(threads)
-    encoder: Any = load(name, weights)
+    weights = weights or _package_folder(name)
+    encoder: Any = _bundled(name).load(name, weights)
     sets = training.assess.figures.test_sets(data)
 
     def figures() -> list[dict[str, Any]]:
@@ -131,13 +133,28 @@ def assess(
 
 @app.command("all")
 def everything(
-    data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2
+    data: Data = DATA, out: Out = OUT, weights: Weights = None, threads: Threads = 2
 ) -> None:
     """All of it: pictures, training, weights, cards."""
     for name in NAMES:
         train(name, data, out, threads)
         export(name, out, weights)
         assess(name, data, out, weights, threads)
+
+
+def _bundled(name: str) -> Any:
+    """Module that loads a bundled encoder."""
+    import importlib
+
+    small = name == "dino-small"
+    return importlib.import_module(
+        "attnwarp_eval.encoders.dino_small" if small else "attnwarp.encoders.bundled"
+    )
+
+
+def _package_folder(name: str) -> Path:
+    folder: Path = _bundled(name).WEIGHTS
+    return folder
 
 
 def _recipe(name: str) -> Any:

@@ -18,7 +18,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from attnwarp.encoders.nets import DinoSmall
+from attnwarp_eval.encoders.dino_small import DinoSmall
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
 from training.worlds.data import Pictures, load
 

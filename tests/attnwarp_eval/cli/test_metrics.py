@@ -4,6 +4,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,8 +15,9 @@ from PIL import Image, ImageOps
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
-from attnwarp.encoders import load_encoder
+from attnwarp.encoders import bundled
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.encoders import load_encoder
 from attnwarp_eval.metrics.registry import METRICS, metric
 from attnwarp_eval.user_images import measure
 from attnwarp_eval.user_images.measure import BATCH, inside, read_picture
@@ -599,30 +601,18 @@ def test_the_encoders_are_listed_and_one_is_described(models):
 def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_named_is_an_error(
     data, monkeypatch
 ):
-    import importlib.util
-
-    result = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name, *a: None if name.endswith("bundled") else result(name),
-    )
     folder, _ = data
+    monkeypatch.setattr(bundled, "load", partial(bundled.load, folder=folder / "nowhere"))
     done = pixels(folder)
     assert done.exit_code == 0 and set(saved(folder)["metrics"]) == {
         "edit.psnr_mean",
         "edit.psnr_pooled",
     }
-    reason = (
-        "needs --perceptual: encoder 'perceptual-small': this installation carries no bundled"
-        " weights"
-    )
+    place = folder / "nowhere" / "perceptual-small.safetensors"
+    reason = f"needs --perceptual: {place}: missing; install the package again"
     assert saved(folder)["not_computed"]["Perceptual distance"].startswith(reason)
     done = pixels(folder, "--perceptual=perceptual-small")
-    assert (
-        done.exit_code == 2
-        and "--perceptual: encoder 'perceptual-small': this installation" in done.stderr
-    )
+    assert done.exit_code == 2 and f"--perceptual: {place}: missing" in done.stderr
 
 
 def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypatch):

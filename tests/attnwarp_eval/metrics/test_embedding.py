@@ -208,7 +208,7 @@ def test_features_of_other_shapes_are_refused():
 
 
 def test_one_edit_of_a_scene_is_more_consistent_than_an_edit_of_one_view():
-    from attnwarp.encoders import load_encoder
+    from attnwarp_eval.encoders import load_encoder
 
     random = np.random.default_rng(8)
     coarse = random.random((8, 10, 3))

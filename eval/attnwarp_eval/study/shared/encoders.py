@@ -7,8 +7,9 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from attnwarp.encoders import Kind, kind_of, load_encoder
+from attnwarp.encoders import Kind
 from attnwarp.errors import InputError
+from attnwarp_eval.encoders import kind_of, load_encoder
 from attnwarp_eval.study.schema import Part, Study, StudyError
 
 
@@ -51,7 +52,7 @@ def identity(name: str, kind: Kind) -> dict[str, Any]:
     """Entries that decide an encoder's figures: weights and preprocessing, not the path.
 
     Raises:
-        InputError: see :func:`attnwarp.encoders.load_encoder`.
+        InputError: see :func:`attnwarp_eval.encoders.load_encoder`.
     """
     return identity_of(load_encoder(name, kind))
 
@@ -66,7 +67,7 @@ def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) 
     """Encoders by kind.
 
     Args:
-        names: names for :func:`attnwarp.encoders.load_encoder`, by kind.
+        names: names for :func:`attnwarp_eval.encoders.load_encoder`, by kind.
         expected: :func:`identity` of each at planning, by kind.
 
     Raises:

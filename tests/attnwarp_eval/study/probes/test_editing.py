@@ -15,8 +15,8 @@ from PIL import Image
 from torch_threads import on_one_thread
 
 import attnwarp_eval
-from attnwarp.encoders.bundled import WEIGHTS
 from attnwarp_eval import metrics
+from attnwarp_eval.encoders.dino_small import WEIGHTS
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report import write_report

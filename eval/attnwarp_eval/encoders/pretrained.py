@@ -28,8 +28,9 @@ from attnwarp.encoders._weights import (
     silent_transformers,
 )
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
-from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
+from attnwarp.encoders.preprocess import Preprocessing, read_json
 from attnwarp.errors import InputError, optional_imports
+from attnwarp_eval.encoders.preprocessing import read_preprocessing
 
 BATCH = 8
 """Number of pictures in a batch: enough for all cores, few enough to fit next to ViT-L's weights.
@@ -137,7 +138,7 @@ class Clip(_Pictures):
 
 
 class Dino(_Pictures):
-    """DINOv2, with registers or without; see :class:`attnwarp.encoders.TokenEncoder`.
+    """DINOv2, with registers or without; see :class:`attnwarp_eval.encoders.TokenEncoder`.
 
     The embedding of a picture is the class token, that of a patch is the patch's token, both after
     the last normalisation.

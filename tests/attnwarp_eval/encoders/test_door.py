@@ -1,12 +1,11 @@
 """Encoders by name: what is known without loading anything, and what is said of a wrong name."""
 
-import importlib.util
-
 import pytest
 from imported_modules import modules_after
 
-from attnwarp import encoders
+from attnwarp import encoders as library
 from attnwarp.errors import InputError
+from attnwarp_eval import encoders
 
 
 @pytest.mark.parametrize(
@@ -52,31 +51,15 @@ def test_another_kind_than_asked_for_is_refused_before_anything_is_loaded():
         encoders.load_encoder("dinov2:/nowhere", "clip")
 
 
-def test_bundled_ones_are_described():
-    assert list(encoders.available()) == [
-        "clip-small",
-        "clip-parts",
-        "dino-small",
-        "perceptual-small",
-    ]
-    assert all(encoders.available().values())
-
-
-@pytest.mark.door
-def test_an_installation_without_bundled_weights_says_so(monkeypatch):
-    result = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name, *a: None if name.endswith("bundled") else result(name),
-    )
+def test_the_library_knows_the_encoders_of_edits_alone():
     with pytest.raises(
-        InputError, match="carries no bundled weights; name a real one: clip:FOLDER"
+        InputError,
+        match="unknown.* Known are clip-small, clip-parts, perceptual-small, lpips:FILE_OR_FOLDER$",
     ):
-        encoders.load_encoder("clip-small")
+        library.load_encoder("dinov2:/models/x")
 
 
 def test_the_door_itself_loads_nothing_heavy():
-    modules = modules_after("from attnwarp.encoders import kind_of; kind_of('clip:x')")
-    assert "attnwarp.encoders" in modules
+    modules = modules_after("from attnwarp_eval.encoders import kind_of; kind_of('clip:x')")
+    assert "attnwarp_eval.encoders" in modules
     assert not modules & {"torch", "transformers", "PIL", "cv2", "scipy"}

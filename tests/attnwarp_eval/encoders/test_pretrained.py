@@ -11,9 +11,10 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch_threads import on_one_thread
 
-from attnwarp.encoders import ImageEncoder, TextImageEncoder, TokenEncoder, load_encoder
-from attnwarp.encoders.preprocess import read_preprocessing
+from attnwarp.encoders import ImageEncoder, TextImageEncoder
 from attnwarp.errors import InputError
+from attnwarp_eval.encoders import TokenEncoder, load_encoder
+from attnwarp_eval.encoders.preprocessing import read_preprocessing
 
 TEXTS = ["a photo of a bear", "A  Bear, in\tthe forest!", "ünïcode 熊 42", ""]
 
