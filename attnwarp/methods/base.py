@@ -293,12 +293,13 @@ def run(
     name: str,
     make: Callable[[Work, Any], Method],
     kind: type[MethodSettings],
+    /,
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     images: Sequence[npt.NDArray[Any]] | None,
     editor: Editor,
     instruction: str,
-    settings: MethodSettings | None,
+    settings: MethodSettings | None = None,
     **options: Unpack[Options],
 ) -> Result:
     """Run a method; the other arguments are those of :func:`attnwarp.methods.by_view`."""

@@ -17,7 +17,19 @@ from attnwarp.methods.base import Method, Options, Result, run
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.settings import PRESETS, MethodSettings
 
-S = TypeVar("S", contravariant=True)
+S = TypeVar("S", bound=MethodSettings, contravariant=True)
+
+
+class DoorOptions(Options, total=False):
+    """Options of all methods, and those of some: a method that has none of them refuses them.
+
+    Args:
+        source: number of the view that is edited first.
+        warps: see :func:`attnwarp.methods.attention_warping`.
+    """
+
+    source: int
+    warps: Warps | None
 
 
 class Door(Protocol[S]):
@@ -31,46 +43,7 @@ class Door(Protocol[S]):
         editor: Editor,
         instruction: str,
         settings: S | None = None,
-        **options: Unpack[Options],
-    ) -> Result:
-        """Run the method."""
-        ...
-
-
-class WarpsDoor(Protocol[S]):
-    """Function of a method that takes warps from elsewhere."""
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        images: Sequence[npt.NDArray[Any]] | None,
-        editor: Editor,
-        instruction: str,
-        settings: S | None = None,
-        *,
-        warps: Warps | None = None,
-        **options: Unpack[Options],
-    ) -> Result:
-        """Run the method."""
-        ...
-
-
-class SourceDoor(Protocol[S]):
-    """Function of a method that begins at one view, and takes warps from elsewhere."""
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        images: Sequence[npt.NDArray[Any]] | None,
-        editor: Editor,
-        instruction: str,
-        settings: S | None = None,
-        *,
-        source: int = 0,
-        warps: Warps | None = None,
-        **options: Unpack[Options],
+        **options: Unpack[DoorOptions],
     ) -> Result:
         """Run the method."""
         ...
@@ -90,7 +63,7 @@ def register(
     METHODS[name], PRESETS[name] = method, Named(presets)
 
 
-def door(kind: type[Method], presets: Mapping[str, MethodSettings]) -> Any:
+def door(kind: Callable[..., Method], presets: Mapping[str, S]) -> Door[S]:
     """Make and register the function of a method's class, under the name of the class's module.
 
     Its documentation is that of the class; arguments of the class beside work and settings are
@@ -100,22 +73,11 @@ def door(kind: type[Method], presets: Mapping[str, MethodSettings]) -> Any:
     of_settings = type(next(iter(presets.values())))
     own = list(inspect.signature(kind).parameters.values())[2:]
 
-    def method(
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        images: Sequence[npt.NDArray[Any]] | None,
-        editor: Editor,
-        instruction: str,
-        settings: Any = None,
-        **options: Any,
-    ) -> Result:
+    def method(*arguments: Any, **options: Any) -> Result:
         given = {part.name: options.pop(part.name) for part in own if part.name in options}
-        return run(
-            name, partial(kind, **given), of_settings,
-            gaussians, cameras, images, editor, instruction, settings, **options,
-        )  # fmt: skip
+        return run(name, partial(kind, **given), of_settings, *arguments, **options)
 
-    *first, settings, options = inspect.signature(method).parameters.values()
+    _, *first, settings, options = inspect.signature(Door.__call__).parameters.values()
     parameters = [
         *first,
         settings.replace(annotation=f"{of_settings.__name__} | None"),

@@ -10,7 +10,7 @@ from typing import Any
 
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, ViewEdit
-from attnwarp.methods.doors import Door, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.settings import (
     MethodSettings,
     checked_start,
@@ -117,4 +117,4 @@ class ByView(Method):
         return [ViewEdit(picture, about) for picture in result.images]
 
 
-by_view: Door[ByViewSettings] = door(ByView, {"default": ByViewSettings()})
+by_view = door(ByView, {"default": ByViewSettings()})

@@ -20,7 +20,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.base import Loop, ViewEdit
 from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
-from attnwarp.methods.doors import SourceDoor, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.work import Work, chunks
 from attnwarp.settings import Count, Share
@@ -139,7 +139,7 @@ class Corresponding(ByWarps):
         return [ViewEdit(edits[view], {"start": start}) for view in batch]
 
 
-corresponding: SourceDoor[CorrespondingSettings] = door(
+corresponding = door(
     Corresponding,
     {
         "default": CorrespondingSettings(),

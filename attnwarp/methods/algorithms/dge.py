@@ -18,7 +18,7 @@ from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.schedule import Grid, following, published_steps
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, ViewEdit
-from attnwarp.methods.doors import Door, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.matching import key_views
 from attnwarp.methods.settings import LAST_STEP, MethodSettings
 from attnwarp.methods.work import KEYS, VIEWS, Work, chunks, parts_of
@@ -175,7 +175,7 @@ class DGE(Method):
         return [timestep >= s.plain_below for timestep in published]
 
 
-dge: Door[DGESettings] = door(
+dge = door(
     DGE,
     {
         "default": DGESettings(),

@@ -20,7 +20,7 @@ from attnwarp.editing.schedule import Grid, following
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, ViewEdit
 from attnwarp.methods.by_warps import ByWarps, CarriedSettings
-from attnwarp.methods.doors import WarpsDoor, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.pictures import Image, Segment, Size
 from attnwarp.methods.settings import needs_start
@@ -173,7 +173,7 @@ _PAPER = FusedSettings(
     distortion=0.0, color_rate=1.0,
 )  # fmt: skip
 
-fused: WarpsDoor[FusedSettings] = door(
+fused = door(
     Fused,
     {
         "default": FusedSettings(),

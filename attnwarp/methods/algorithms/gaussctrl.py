@@ -20,7 +20,7 @@ from attnwarp.editing.inversion import inversion_rows, invert_view
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.base import Loop, Method, ViewEdit
-from attnwarp.methods.doors import Door, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.settings import (
     STABLE_DIFFUSION,
     Latents,
@@ -163,7 +163,7 @@ class GaussCtrl(Method):
         return self._latents[view]
 
 
-gaussctrl: Door[GaussCtrlSettings] = door(
+gaussctrl = door(
     GaussCtrl,
     {
         "default": GaussCtrlSettings(),

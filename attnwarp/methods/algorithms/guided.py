@@ -17,7 +17,7 @@ from attnwarp.encoders import load_encoder
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, ViewEdit
 from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
-from attnwarp.methods.doors import SourceDoor, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.settings import (
     LAST_STEP,
@@ -179,7 +179,7 @@ class Guided(ByWarps):
         return of
 
 
-guided: SourceDoor[GuidedSettings] = door(
+guided = door(
     Guided,
     {
         "default": GuidedSettings(),

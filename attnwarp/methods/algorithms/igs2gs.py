@@ -11,7 +11,7 @@ from functools import partial
 from attnwarp.editing.schedule import Grid
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, ViewEdit
-from attnwarp.methods.doors import Door, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.settings import (
     MethodSettings,
     checked_start,
@@ -100,7 +100,7 @@ class IGS2GS(Method):
 
 _RELEASED = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5, grid="scheduler")
 
-igs2gs: Door[IGS2GSSettings] = door(
+igs2gs = door(
     IGS2GS,
     {
         "default": IGS2GSSettings(),

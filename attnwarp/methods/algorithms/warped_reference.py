@@ -15,7 +15,7 @@ import torch
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, ViewEdit
 from attnwarp.methods.by_warps import ByWarps, SourceSettings, checked_source
-from attnwarp.methods.doors import SourceDoor, door
+from attnwarp.methods.doors import door
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.pictures import Image
 from attnwarp.methods.settings import (
@@ -127,6 +127,4 @@ class WarpedReference(ByWarps):
         return picture, float(mask.mean())
 
 
-warped_reference: SourceDoor[WarpedReferenceSettings] = door(
-    WarpedReference, {"default": WarpedReferenceSettings()}
-)
+warped_reference = door(WarpedReference, {"default": WarpedReferenceSettings()})

@@ -269,6 +269,8 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
         run("by_view", checkpoint_seconds=None)
     with pytest.raises(ValueError, match="option: got 'reprt'.*'report'"):
         run("by_view", reprt=print)
+    with pytest.raises(ValueError, match="option: got 'source'"):
+        run("igs2gs", source=1)
     with pytest.raises(ValueError, match="image_guidance: this editor has none"):
         run("gaussctrl", GaussCtrlSettings(image_guidance=1.5))
     small = [views[0], *(view.resize(8, 8) for view in views[1:])]
