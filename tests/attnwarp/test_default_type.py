@@ -62,7 +62,7 @@ def methods_but_one_at_the_door():
 
 @functools.cache
 def edit_of(name):
-    """What edits by a method, and its edit in a process of torch's own defaults."""
+    """Return what edits by a method, and its edit in a process of torch's own defaults."""
     model, views = splats(), cameras(3)
     images = pictures(model, views)
     settings = preset(name, steps=2, iterations=3, background="random")
@@ -91,7 +91,7 @@ def test_an_edit_has_the_same_bits_in_a_process_of_other_defaults(name, process)
 
 @functools.cache
 def fit_of(kind):
-    """What fits, and its fit in a process of torch's own defaults."""
+    """Return what fits, and its fit in a process of torch's own defaults."""
     model, views = splats(), cameras()
     seen = Views(views, pictures(model, views))
     settings = FitSettings(

@@ -33,7 +33,7 @@ STUDY = {
     "scenes": ["spheres"],
     "views": ["yaw090"],
     "spp": 1,
-    "variants": {"plain": {}, "double": {"stretch": 2.0, "method": "mine"}},
+    "variants": {"plain": {}, "double": {"stretch": 2.0}},
     "probes": {"chord": ["plain", "double"]},
 }
 
@@ -85,7 +85,7 @@ def test_a_plugin_registers_its_probe_and_its_method(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_plugin_of_the_environment_has_its_probe_and_method_in_every_worker(tmp_path):
+def test_a_plugin_of_the_environment_has_its_probe_in_every_worker(tmp_path):
     (tmp_path / "my_plugin.py").write_text(PLUGIN)
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(STUDY))
     paths = [str(tmp_path), str(HELPERS), os.environ.get("PYTHONPATH", "")]

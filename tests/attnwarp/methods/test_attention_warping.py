@@ -68,7 +68,7 @@ def run(scene, editor, folder=None, settings=QUICK, words="a bear", **more):
 
 
 PROGRESS = []
-"""What the finished edit reported."""
+"""Reports of the finished edit."""
 
 
 @pytest.fixture(scope="module")
