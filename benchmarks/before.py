@@ -1,7 +1,8 @@
-"""Seconds of an edit, of tuning and of a fit, as ratios against an earlier commit.
+"""Seconds of a start, of edits, of tuning and of a fit, as ratios against an earlier commit.
 
     python -m benchmarks.before                    # against the commit before
     python -m benchmarks.before 1.0 --rounds 5     # against a tag
+    python -m benchmarks.before --figures start fit
 
 Commands of the earlier commit, of this tree, and of the earlier commit again run in turn. The last
 ratio tells what a ratio of equal code is here. CPU seconds say what work costs, also on a busy
@@ -22,8 +23,11 @@ from pathlib import Path
 from benchmarks import command
 
 HERE = Path(__file__).parents[1]
-EDIT = ("edit", "bear", "--instruction", "make the bear red", "--stages", "1")
+WHOLE = ("edit", "bear", "--instruction", "make the bear red")
+EDIT = (*WHOLE, "--stages", "1")
 COMMANDS = {
+    "start": ("edit", "--help"),
+    "whole edit": WHOLE,
     "edit": (*EDIT, "--steps", "4", "--iterations", "0"),
     "tune": (*EDIT, "--steps", "1", "--iterations", "200"),
     "fit": ("fit", "{scene}", "--iterations", "300"),
@@ -68,16 +72,19 @@ def table(figures: dict[str, list[list[tuple[float, float]]]]) -> str:
         spent = statistics.median(now[0] for _, now, _ in rounds)
         cores = statistics.median(now[0] / now[1] for _, now, _ in rounds)
         lines.append(
-            f"| {name} | {spent:.1f} | {cpu:.2f} | {wall:.2f} | {cores:.2f} | {same:.2f} |"
+            f"| {name} | {spent:.2f} | {cpu:.2f} | {wall:.2f} | {cores:.2f} | {same:.2f} |"
         )
     return "\n".join(lines)
 
 
 def main() -> None:
     """Run the command line."""
-    parser = command.parser("before", "Time an edit, tuning and a fit against an earlier commit.")
+    parser = command.parser("before", "Time what commands cost against an earlier commit.")
     parser.add_argument("commit", nargs="?", default="HEAD~1", help="the earlier one (HEAD~1)")
     parser.add_argument("--rounds", type=int, default=3, help="times each is measured (3)")
+    parser.add_argument(
+        "--figures", nargs="+", choices=COMMANDS, default=[*COMMANDS], help="what is timed (all)"
+    )
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
@@ -91,7 +98,7 @@ def main() -> None:
         subprocess.run(
             [sys.executable, "-m", "attnwarp", *made], cwd=HERE, check=True, capture_output=True
         )
-        commands = {k: [a.format(scene=scene) for a in v] for k, v in COMMANDS.items()}
+        commands = {k: [a.format(scene=scene) for a in COMMANDS[k]] for k in options.figures}
         figures = compare(old, HERE, commands, options.rounds, options.threads)
     command.write_figures(options.out, figures)
     print(table(figures))
