@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import mpmath
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
+from attnwarp.io import read_ply
 from attnwarp.render import constants
 from attnwarp_eval.stability.case import Bound, Way, hard
 from attnwarp_eval.stability.rendered import (
@@ -60,6 +63,13 @@ def _needle(thickness: float) -> Shot:
     scales = torch.tensor([thickness, 0.3, thickness], dtype=torch.float64)
     turn = [math.cos(0.2), 0.1, 0.05, math.sin(0.2)]
     return Shot(splats([[0, 0, 4]], scales, 0.8, kind="3d", quats=[turn]), front_camera(), CROSS)
+
+
+def _long_needle(ratio: float) -> Shot:
+    scales = torch.tensor([0.01, 0.01 * ratio, 0.01], dtype=torch.float64)
+    turn = [math.cos(0.6), 0, 0.05, math.sin(0.6)]  # aslant in the picture and in depth
+    made = splats([[0.02, 0.01, 4]], scales, 0.8, kind="3d", quats=[turn])
+    return Shot(made, front_camera(), CROSS, {"depth": "peak"})
 
 
 def _floor(sigma: float) -> Shot:
@@ -227,6 +237,46 @@ def _facing_discs(
     return color, decided
 
 
+def _on_a_pixel(count: float, way: Way) -> float:
+    """Error of the colour and the alpha of shuffled splats on one ray, the farther the redder."""
+    n, opacity = int(count), 0.005
+    rank = np.random.default_rng(0).permutation(n)
+    means = np.zeros((n, 3))
+    means[:, 2] = 2 + 4 * rank / n
+    # Red rises over the splats before the ray ends, and is 1 beyond.
+    stop = math.ceil(math.log(constants.TRANSMITTANCE_STOP) / math.log1p(-opacity))
+    colors = np.zeros((n, 3))
+    colors[:, 0] = np.minimum(rank / stop, 1)
+    made = Shot(splats(means, 1.0, opacity, colors=colors), front_camera(1, 30.0), [(0, 0)])
+    base = made.gaussians.to(dtype=way.dtype)
+    view, drawn = made.render(way, base), min(n, stop)
+    with mpmath.workdps(50):
+        keep = 1 - mpmath.mpf(float(base.opacities[0].double()))
+        # sum_k k (1 - q) q^k over k < m, in closed form.
+        red = (keep - drawn * keep**drawn + (drawn - 1) * keep ** (drawn + 1)) / (1 - keep) / stop
+        mine = float(view.color[0, 0, 0]), float(view.alpha[0, 0])
+        return float(max(abs(mine[0] - red), abs(mine[1] - (1 - keep**drawn))))
+
+
+def _stored_logit(logit: float, way: Way) -> float:
+    """Error of opacities read from the logits of a file, +-x, and of what two such splats draw."""
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    head = "".join(f"property float {name}\n" for name in names.split())
+    rows = [[0, 0, z, 0, 0, 0, x, -1, -1, -1, 1, 0, 0, 0] for z, x in ((4, -logit), (5, logit))]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "splats.ply"
+        start = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\n{head}end_header\n"
+        path.write_bytes(start.encode() + np.array(rows, "<f4").tobytes())
+        read = read_ply(path)
+    with mpmath.workdps(50):
+        exact = [1 / (1 + mpmath.exp(-mpmath.mpf(float(np.float32(row[6]))))) for row in rows]
+        clear, solid = (min(value, mpmath.mpf(constants.ALPHA_MAX)) for value in exact)
+        clear = clear if clear >= constants.ALPHA_MIN else mpmath.mpf(0)
+        seen = Shot(read, front_camera(), [(16, 16)]).render(way).alpha[16, 16]
+        wrong = [float(a) - b for a, b in zip(read.opacities, exact, strict=True)]
+        return float(max(map(abs, [*wrong, float(seen) - (1 - (1 - clear) * (1 - solid))])))
+
+
 def _coverage(sigma: float, way: Way) -> float:
     """Mean coverage of a splat over the places of its centre in a pixel, against its integral."""
     steps, apart, focal, depth = 6, 12, 40.0, 4.0
@@ -287,6 +337,19 @@ CASES = [
         },
     ),
     hard("needle", against_exact(_needle), RENDERERS, bounds=render_bounds()),
+    hard("long_needle", against_exact(_long_needle), RENDERERS, bounds=render_bounds()),
+    hard(
+        "splats_on_a_pixel",
+        _on_a_pixel,
+        FORWARD,
+        bounds=Bound("of 1", 1e-4, "the declared limit at which a ray ends"),
+    ),
+    hard(
+        "stored_logit",
+        _stored_logit,
+        tuple(way for way in FORWARD if way.precision == "float32"),
+        bounds=Bound("opacity", 1e-6, "a float32 of about 1 has steps of 1.2e-7"),
+    ),
     hard("scene_scale_splats", against_exact(_scale), RENDERERS, bounds=render_bounds()),
     hard(
         "deep_ray",
