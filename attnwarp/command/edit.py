@@ -292,7 +292,9 @@ def marked(
         report.log(f"--at {typed(marks, size)} is drawn in {out / MARKED}")
 
     def segments(splats: Gaussians) -> list[Segment]:
-        at = [camera.width / size[0] * v for v in marks.at or ()]
+        # Shrunk sides are rounded, so a click on the border could leave the picture.
+        sides = camera.width, camera.height
+        at = [min(sides[0] / size[0] * v, s) for v, s in zip(marks.at or (), sides, strict=False)]
         mask = of_source(piece_around(splats, camera, at)) if early is None else early
         lifted = lifted_segments(mask, splats, views, index, report)
         if not any((segment > 0.5).any() for segment in lifted):

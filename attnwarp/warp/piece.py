@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp.view import render_surface
 
@@ -46,6 +47,9 @@ def piece_around(
         near: near-plane depth, in scene units; by default a hundredth of the splats' median
             distance.
 
+    Raises:
+        InputError: the point lies outside of the picture.
+
     Example:
         >>> from attnwarp.trial import disc, view
         >>> bool(piece_around(disc(0.3), view(), (0, 0)).all())  # nothing there
@@ -54,12 +58,18 @@ def piece_around(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    x, y = at
+    if not (0 <= x <= camera.width and 0 <= y <= camera.height):
+        raise InputError(
+            f"at: got {x:g},{y:g}, expected px inside the picture of"
+            f" {camera.width} x {camera.height}"
+        )
     seen = render_surface(gaussians, camera, near=near)
     depth, normal, alpha = (
         np.asarray(v, np.float64) for v in (seen.depth, seen.normal, seen.alpha)
     )
     height, width = depth.shape
-    own = min(int(at[1]), height - 1), min(int(at[0]), width - 1)
+    own = min(int(y), height - 1), min(int(x), width - 1)
     solid = (alpha > 0.5) & np.isfinite(depth)
     if not solid[own]:
         return np.ones_like(solid)

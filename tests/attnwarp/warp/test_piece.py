@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
+from attnwarp.errors import InputError
 from attnwarp.warp import piece_around
 
 CAMERA = Camera.look_at((0, -4, 1.5), (0, 0, 0.5), width=96, height=96, fov_y=50)
@@ -96,3 +97,10 @@ def test_a_piece_ends_at_the_slab_that_it_stands_on():
     rows, columns = np.nonzero(piece)
     found = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     assert np.abs(np.array(found) - (left, top, right, bottom)).max() < 3  # discs are 2 px wide
+
+
+@pytest.mark.parametrize("at", [(-1, 5), (5, -1), (CAMERA.width + 1, 5), (np.nan, 5)])
+def test_a_point_outside_of_the_picture_has_no_piece(splats, at):
+    # -1 would read the opposite edge.
+    with pytest.raises(InputError, match=r"at: got .* inside the picture of"):
+        piece_around(splats, CAMERA, at)

@@ -7,8 +7,10 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
+from attnwarp.editing.segment import cut_out
+from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
-from attnwarp.warp import lift_masks
+from attnwarp.warp import lift_masks, piece_around
 from attnwarp_eval.stability.case import Way, exact, hard, ways
 from attnwarp_eval.stability.closed_forms import orbit, plane_depth, sphere
 from attnwarp_eval.stability.rendered import splats
@@ -135,6 +137,48 @@ def _part(side: float, way: Way) -> float:
     )
 
 
+def _clicked(distance: float, way: Way) -> float:
+    """Pixels far off, of what clicks at a distance from each edge of the picture mark: by depth a
+    band across the picture, by colours a square that the edge cuts.
+    """
+    worst, refused, ends = 0.0, [], (distance, SIZE - distance)
+    for upright in (False, True):
+        if way.backend == "piece":
+            half = (0.4, 6) if upright else (6, 0.4)
+            scene = _scene(way, (_wall(0, half, 0.06), 0.03), (_wall(-2.5, (6, 6), 0.12), 0.06))
+        for end in ends:
+            at = (SIZE / 2, end) if upright else (end, SIZE / 2)
+            x, y = (np.arange(SIZE) + 0.5 for _ in at)
+            true = (np.abs(x - ends.index(end) * SIZE) < 16) & (np.abs(y[:, None] - SIZE / 2) < 8)
+            true = true.T if upright else true
+            try:
+                if way.backend == "piece":
+                    true = _square_mask(_view(SOURCE), *half)
+                    mine = piece_around(scene, _view(SOURCE), at)
+                else:
+                    mine = cut_out(np.where(true[..., None], 0.7, 0.3).repeat(3, -1), at=at)
+                worst = max(worst, _far_off(mine, true))
+            except InputError as problem:
+                refused.append(problem)
+    if len(refused) == 4:
+        raise refused[0]
+    return float("inf") if refused else worst
+
+
+def _hidden(yaw: float, way: Way) -> float:
+    """Pixels far off, of a ball lifted from a view and rendered in one that a wall hides it from,
+    and values that are not finite.
+    """
+    step = 12 / 2 / WALL
+    scene = _scene(way, (_ball(), 0.04), (_wall(-1.5, (6, 6), step), step / 2))
+    source, target = _view(SOURCE), _view(yaw)
+    lifted = lift_masks(scene, [source], [_ball_mask(source)], backend=way.backend)
+    seen = np.asarray(lifted.render(target))
+    # Before the wall's plane nothing stands between the camera and the ball.
+    free = _ball_mask(target) & (target.position[0] > -1.5)
+    return _far_off(seen > 0.5, free) + float((~np.isfinite(seen)).sum())
+
+
 WAYS = ways("cpu")
 FAR = exact("pixels more than 3 px off")
 
@@ -143,4 +187,12 @@ CASES = [
     hard("lifted_thin", _thin, WAYS, bounds=FAR),
     hard("lifted_size", _size, WAYS, bounds=FAR),
     hard("lifted_part", _part, WAYS, bounds=FAR),
+    hard(
+        "click_on_the_edge",
+        _clicked,
+        tuple(Way(engine, "float32") for engine in ("piece", "colors")),
+        bounds=FAR,
+        must_refuse=lambda distance, way: distance < 0,
+    ),
+    hard("lifted_hidden", _hidden, WAYS, bounds=FAR),
 ]
