@@ -30,7 +30,7 @@ __all__ = [
 
 ROOMS = [
     f"attnwarp_eval.stability.cases.{room}"
-    for room in ("splats", "warps", "lifting", "truth", "metrics", "editing", "gradients")
+    for room in ("splats", "warps", "lifting", "truth", "metrics", "editing", "gradients", "fits")
 ]
 """Modules with ``CASES``, by package of the library. Plugins append theirs."""
 
