@@ -20,7 +20,7 @@ from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import DDIM, Prediction
 from attnwarp.methods.algorithms.attention_warping import CORRECTED, a_t, blend, inject
 from attnwarp.methods.pictures import to_bytes
-from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
+from attnwarp.warp import FeatureWarp, Surface, WarpedView, preset, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Way, exact, hard, ways
 from attnwarp_eval.stability.cases.warps import (
@@ -216,6 +216,46 @@ def _apart(yaw: float, way: Way) -> float:
     return float(wrong + (result[:, untouched] != new[:, untouched]).sum())
 
 
+def _behind_a_card(half: float, way: Way) -> float:
+    """Tokens of a plane accepted though a card close to the source hides it from there, or rejected
+    though nothing does; and values that a blend changes there, or that are not finite.
+    """
+    (source, target), card = (orbit(yaw, size=SIZE, height=1) for yaw in (0, 40)), 3.5
+
+    def off_center(points: np.ndarray) -> np.ndarray:
+        # Where the line from the source to a point crosses the card's plane, from its middle.
+        x = source.position[0]
+        crossing = source.position + (x - card) / (x - points[..., :1]) * (points - source.position)
+        return np.asarray(np.abs((crossing - source.position * card / x)[..., 1:]).max(-1))
+
+    depths = [plane_depth(camera, (1, 0, 0), 0.0) for camera in (source, target)]
+    centers = target.pixel_centers()
+    seen, points = (
+        camera.unproject(centers, depth)
+        for camera, depth in zip((source, target), depths, strict=True)
+    )
+    on_card = off_center(seen) < half
+    depths[0] = np.where(on_card, plane_depth(source, (1, 0, 0), card), depths[0])
+    away = off_center(points) - half
+    xy, z = source.project(points)
+    inside = (z > 0) & (xy >= 0).all(-1) & (xy <= SIZE).all(-1)
+    normal = np.broadcast_to([1.0, 0, 0], (SIZE, SIZE, 3))
+    surfaces = [Surface(torch.from_numpy(depth), normal) for depth in depths]
+    view = warp_surfaces(
+        source, target, surfaces[1], surfaces[0], preset("corrected"), backend=engine_of(way),
+        warn_empty=False,
+    )  # fmt: skip
+    layer = view.at((SIZE, SIZE))
+    tokens, new = _tokens(way)
+    result = first_step(layer, tokens + 2, new, 1.0)
+    # Within a pixel and a half of the card's outline both depths are read.
+    near = np.abs(away) * source.K[0, 0] / (source.position[0] - card) < 1.5
+    wrong = (layer.mask.numpy() != (inside & (away > 0))) & ~near
+    hidden = torch.from_numpy((away < 0) & ~near).reshape(-1)
+    changed = (result[:, hidden] != new[:, hidden]).sum() + (~result.isfinite()).sum()
+    return float(wrong.sum() + changed)
+
+
 def _latents(size: float, way: Way) -> float:
     """Distance in px of the layer's positions from exact ones; tokens must be finite."""
     n = int(size)
@@ -349,6 +389,7 @@ CASES = [
     hard("empty_mask_of_tokens", _outside, EVERY_TYPE, bounds=exact("changed values")),
     hard("one_view", _views_of_a_batch, ways("reference", "cpu"), bounds=ONE_VIEW),
     hard("views_apart", _apart, EVERY_TYPE, bounds=exact("wrong tokens")),
+    hard("hidden_from_the_source", _behind_a_card, EVERY_TYPE, bounds=exact("wrong tokens")),
     hard(
         "one_latent",
         _latents,

@@ -55,8 +55,8 @@ def _ground() -> Gaussians:
 
 
 def _wrong_sky(start: Gaussians, views: Views) -> float:
-    """Number of a sky's splats below the horizon, and per mille of the directions well above it that
-    a picture shows, with no splat of the sky's colour near them.
+    """Number of a sky's splats below the horizon, and per mille of the shown directions well above
+    it that have no splat of the sky's colour near them.
     """
     every = np.random.default_rng(0).normal(size=(20_000, 3))
     every /= np.linalg.norm(every, axis=1, keepdims=True)
