@@ -114,11 +114,9 @@ def undistort(
         count = sum(lens is not None for lens in dataset.lenses)
         with reporter(title=out.name) as report:
             result = attnwarp.io.undistort(dataset, out, report=report)
-        pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
-        before = [camera for camera, path in pairs if path is not None]
         sizes = {
             f"{old.width} x {old.height} px became {new.width} x {new.height}"
-            for old, new in zip(before, result.cameras, strict=True)
+            for old, new in zip(dataset.with_pictures().cameras, result.cameras, strict=True)
             if (old.width, old.height) != (new.width, new.height)
         }
         resized = "".join(f"; {size}" for size in sorted(sizes)[:3])

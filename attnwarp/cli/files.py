@@ -118,10 +118,10 @@ def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
     """
     from attnwarp.io.names import file_stems
 
-    there = [k for k, image in enumerate(dataset.image_paths) if image is not None]
-    name = file_stems([dataset.cameras[k] for k in there])[index]
+    pictured = dataset.with_pictures()
+    name = file_stems(pictured.cameras)[index]
     if (
-        dataset.splits[there[index]] in (None, "train")
+        pictured.splits[index] in (None, "train")
         and not (path.parent / "held_out" / f"{name}.png").is_file()
     ):
         return ""
@@ -158,10 +158,10 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
     from attnwarp.methods.scene import near_of
     from attnwarp.render import render
 
-    there = [k for k, image in enumerate(dataset.image_paths) if image is not None]
-    spread_out = np.linspace(0, len(there) - 1, LOOKS if there else 0).round().astype(int)
-    chosen = [there[k] for k in dict.fromkeys(spread_out.tolist())]
-    views = load_views(dataset.select(chosen), max_size=LOOK_SIZE)
+    pictured = dataset.with_pictures()
+    spread_out = np.linspace(0, len(pictured) - 1, LOOKS if pictured else 0).round().astype(int)
+    chosen = pictured.select(list(dict.fromkeys(spread_out.tolist())))
+    views = load_views(chosen, max_size=LOOK_SIZE)
     near = near_of(dataset.cameras, splats)
     error = spread = 0.0
     count = 0

@@ -243,8 +243,7 @@ def _fit(
     device = choose(device, report)
     dataset = read_views(data, reading)
     # A view without a picture can be neither fitted nor held out.
-    there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
-    dataset = dataset.select(there) if there else dataset
+    dataset = dataset.with_pictures() or dataset
     try:
         train, test = attnwarp.fit.hold_out(dataset, apart)
     except ValueError as error:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp.camera import Camera
 from attnwarp.command.marks import (
     HOW,
     MARKED,
@@ -155,7 +154,7 @@ def edit_dataset(
         settings = settings.changed(size=editor.own_size)
     max_size = options.max_size
     if splats is None:
-        max_size = shrunk_to(max_size, _with_picture(dataset), device, report)
+        max_size = shrunk_to(max_size, dataset.with_pictures().cameras, device, report)
     views = load_views(dataset, max_size=max_size, exposures=exposures)
     if exposures:
         known = sum(change is not None for change in views.exposures)
@@ -231,8 +230,7 @@ def _by_hand(
     """Read the edit of the source view made elsewhere, (h, w, 3), if given."""
     if source_picture is None:
         return None
-    # Only cameras with a picture are views.
-    pictures = [path for path in dataset.image_paths if path is not None]
+    pictures = dataset.with_pictures().image_paths
     pixels, top = read_over_black(source_picture, beside=pictures[index])
     by_hand = (pixels / top).astype(np.float32)
     h, w, _ = by_hand.shape
@@ -260,7 +258,8 @@ def marked(
     report: Reporter,
 ) -> Callable[[Gaussians], list[Segment] | None]:
     """Read the marks now and return a function from splats to the segments of all views."""
-    pictures = [path for path in dataset.image_paths if path is not None]
+    pictured = dataset.with_pictures()
+    pictures = pictured.image_paths
     if marks.masks is not None:
         given = _masks(marks.masks, views.cameras, pictures, report)
         return lambda splats: given
@@ -268,7 +267,7 @@ def marked(
         if editor_name in bundled():
             say_unmarked(editor_name, report)
         return lambda splats: None
-    camera, full = views.cameras[index], _with_picture(dataset)[index]
+    camera, full = views.cameras[index], pictured.cameras[index]
     size = full.width, full.height
     check_marks(*size, box=marks.box, at=marks.at)
 
@@ -374,25 +373,19 @@ def check_asked(
 def check_marked(options: EditOptions, dataset: Dataset) -> None:
     """Refuse an unknown source view, and marks outside its picture."""
     index, marks = view_of(dataset, options.source), options.marks
-    camera = _with_picture(dataset)[index]
+    camera = dataset.with_pictures().cameras[index]
     check_marks(camera.width, camera.height, box=marks.box, at=marks.at)
-
-
-def _with_picture(dataset: Dataset) -> list[Camera]:
-    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
-    return [camera for camera, image in pairs if image is not None]
 
 
 def view_of(dataset: Dataset, name: str | None) -> int:
     """Find a view's number by its name among views with a picture; see :func:`number_of`. No name
     means the first training view."""
     if name is None:
-        posed = zip(dataset.splits, dataset.image_paths, strict=True)
-        splits = [split for split, image in posed if image is not None]
+        splits = dataset.with_pictures().splits
         return splits.index("train") if "train" in splits else 0
     pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
     left_out = [camera.name for camera, image in pairs if image is None]
-    return number_of([camera.name for camera in _with_picture(dataset)], name, left_out)
+    return number_of([camera.name for camera in dataset.with_pictures().cameras], name, left_out)
 
 
 def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> int:
@@ -421,7 +414,7 @@ def _spellings(names: Sequence[str]) -> list[list[str]]:
 
 
 def _masks(
-    folder: Path, cameras: Any, pictures: Sequence[Path], report: Reporter
+    folder: Path, cameras: Any, pictures: Sequence[Path | None], report: Reporter
 ) -> list[npt.NDArray[np.bool_]]:
     """Read the mask of each view from NAME.png, (H, W) bool: white is edited."""
     if not folder.is_dir():

@@ -152,7 +152,7 @@ def source_mask(
     marks: Marks,
     camera: Camera,
     image: npt.NDArray[Any],
-    picture: Path,
+    picture: Path | None,
     size: tuple[int, int],
     out: Path,
     device: str,

@@ -107,6 +107,17 @@ class Dataset:
         chosen = {name: [getattr(self, name)[i] for i in indices] for name in OF_IMAGES}
         return replace(self, **chosen)  # type: ignore[arg-type]
 
+    def with_pictures(self) -> Dataset:
+        """Select the cameras whose image is not missing.
+
+        Example:
+            >>> from attnwarp.trial import view
+            >>> data = Dataset([view(), view()], [None, Path("b.png")], splits=["train", "test"])
+            >>> data.with_pictures().splits
+            ['test']
+        """
+        return self.select([i for i, path in enumerate(self.image_paths) if path is not None])
+
     def split(self, name: str) -> Dataset:
         """Select the images of one split.
 

@@ -60,7 +60,7 @@ def undistort(
         (42, [None])
     """
     folder = Path(folder)
-    dataset = dataset.select([i for i, path in enumerate(dataset.image_paths) if path is not None])
+    dataset = dataset.with_pictures()
     if not len(dataset):
         raise ValueError(
             "dataset: none of its cameras has an image that is there; put the images where the data"

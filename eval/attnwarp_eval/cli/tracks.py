@@ -68,8 +68,7 @@ def tracks(
             check.one_of(name, list(PRESETS), "--preset")
         if not ply:
             raise InputError("--ply: expected splats to judge")
-        dataset = read_views(data, reading)
-        dataset = dataset.select([k for k, path in enumerate(dataset.image_paths) if path])
+        dataset = read_views(data, reading).with_pictures()
         found = find.find_tracks(data, dataset, out / find.FILE, model=model, report=report)
         views = load_views(dataset, max_size=max_size)
         page = written.Page(out, views, found.resized(dataset.cameras, views.cameras))
