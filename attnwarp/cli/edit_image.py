@@ -110,7 +110,7 @@ def edit_image(
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import dtype_of, load_editor
     from attnwarp.methods.change import mean_change, say_little
-    from attnwarp.methods.pictures import enlarged_change, to_bytes
+    from attnwarp.methods.pictures import edit_size, enlarged_change, resized, to_bytes
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
@@ -122,8 +122,9 @@ def edit_image(
     model.check_text(instruction)
     torch.set_num_threads(threads or core_count())
     longest = size or model.own_size
-    whole, image = image, _fit(image, longest, model.side_multiple)
-    h, w = image.shape[:2]
+    whole = image
+    h, w = edit_size(whole.shape[0], whole.shape[1], longest, model.side_multiple)
+    image = resized(whole, (h, w))
     _tell_stretch(whole.shape, image.shape, model.side_multiple)
     share: Any = None
     if mask is not None:
@@ -176,20 +177,6 @@ def _read(path: Path) -> Image:
     stored = read_upright(path)
     values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
     return values[..., :3] * values[..., 3:] if stored.shape[2] == 4 else values
-
-
-def _fit(image: Image, longest: int, multiple: int) -> Image:
-    """Resize a picture to a longest side, rounding its sides to multiples."""
-    import cv2
-    import numpy as np
-
-    h, w = image.shape[:2]
-    scale = longest / max(h, w)
-    width, height = (max(multiple, round(n * scale / multiple) * multiple) for n in (w, h))
-    if (height, width) == (h, w):
-        return image
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    return np.clip(cv2.resize(image, (width, height), interpolation=how), 0, 1)
 
 
 def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
