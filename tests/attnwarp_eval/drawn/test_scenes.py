@@ -19,7 +19,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import likely_bounces
 from attnwarp_eval.truth import Geometry
-from attnwarp_eval.truth.bounces import search, worlds
+from attnwarp_eval.truth.bounces import search
 from training.worlds.data import SPLITS
 from training.worlds.editing_pairs import PAIR_SPLITS
 
@@ -139,9 +139,9 @@ def test_a_smaller_population_is_the_beginning_of_a_larger_one():
 @pytest.mark.parametrize("number", range(8))
 def test_the_bounces_and_the_plan_of_a_drawn_scene_are_certified(number, coarse_textures):
     scene = Scene(draw(number, seed=13).spec)
-    for (edit, _), world in worlds(scene):
-        if edit in (None, "material", "light"):
-            found = search(world).bounces
-            assert found != "unlimited" and found <= likely_bounces(world.spec), world.name
+    edits = [edit.name for edit in scene.edits if edit.name in {"material", "light"}]
+    for world in (scene, *map(scene.edited, edits)):
+        found = search(world).bounces
+        assert found != "unlimited" and found <= likely_bounces(world.spec), world.name
     result = prove(scene.with_size(64, 64), seconds=60)
     assert result.verdict == "certified", result.words
