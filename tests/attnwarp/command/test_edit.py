@@ -510,7 +510,7 @@ def test_a_source_whose_picture_is_missing_is_said_to_be(place, tmp_path):
 def test_settings_that_an_edit_cannot_have_are_refused_before_the_fit(
     setting, message, place, tmp_path
 ):
-    result = run(place, tmp_path, "--set", setting)
+    result = run(place, tmp_path, "--steps", 2, "--set", setting)
     assert result.exit_code == 2
     assert message in result.output
     assert not any(tmp_path.iterdir())

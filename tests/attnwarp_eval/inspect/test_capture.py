@@ -133,7 +133,7 @@ def test_inspecting_an_edit_writes_nothing_to_its_folder(folders, tmp_path):
 def test_what_is_missing_is_named_with_the_remedy(folders, tmp_path):
     for arguments, message in (
         ((folders / "edit", folders), "name them with --ply FILE.ply"),
-        ((tmp_path, folders), r"expected splats \(.ply, .splat\) or a folder of attnwarp edit"),
+        ((tmp_path, folders), r"expected splats \(.*\) or a folder of attnwarp edit"),
     ):
         with pytest.raises(InputError, match=message):
             subject.of_capture(*arguments)
