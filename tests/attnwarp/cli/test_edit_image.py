@@ -162,6 +162,22 @@ def test_a_marked_thing_alone_is_edited(folder, tmp_path):
         assert np.array_equal(cv2.imread(str(tmp_path / "o.png")), expected)
 
 
+def test_what_is_not_marked_stays_where_only_rounding_resizes_the_picture(folder, tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (42, 64, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), pixels)
+    marked = np.zeros((42, 64), np.uint8)
+    marked[:, 32:] = 255
+    cv2.imwrite(str(tmp_path / "m.png"), marked)
+    result = run(
+        tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "o.png", "--steps", 1,
+        "--size", 64, "--mask", tmp_path / "m.png",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    edited = cv2.imread(str(tmp_path / "o.png"))
+    assert np.array_equal(edited[:, :32], pixels[:, :32])
+    assert not np.array_equal(edited[:, 32:], pixels[:, 32:])
+
+
 def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_path):
     cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 64, 3), 128, np.uint8))
     result = run(
