@@ -71,17 +71,6 @@ def check_sums(folder: Path) -> None:
             )
 
 
-def write_sums(folder: Path) -> None:
-    """Write the SHA-256 of every file of an editor, for :func:`check_sums`."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix in (".json", ".safetensors"))
-    sums = {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in files
-        if path.name != SUMS
-    }
-    (folder / SUMS).write_text(json.dumps(sums, indent=1) + "\n")
-
-
 def thread_count(editor: Any) -> int:
     """Number of torch threads for a measured editor: one for a small UNet, so that figures depend
     on no machine's cores, and all cores for a large one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
-from attnwarp.editing.small import write_sums
+from attnwarp.editing.small import SUMS
 from training import steps
 from training.editors.depth import DEPTH_STAGES, DepthNet, DepthStage
 from training.editors.net import TOKENS, EditorNet, scheduler
@@ -70,10 +71,21 @@ def _write(
         "image_encoder": [None, None],
     }  # fmt: skip
     (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
-    write_sums(folder)
+    _write_sums(folder)
     for path in folder.rglob("*"):  # safetensors makes files that only their owner can read
         path.chmod(0o755 if path.is_dir() else 0o644)
     return folder
+
+
+def _write_sums(folder: Path) -> None:
+    """Write the SHA-256 of every file of an editor, for :func:`attnwarp.editing.small.check_sums`."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix in (".json", ".safetensors"))
+    sums = {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+        if path.name != SUMS
+    }
+    (folder / SUMS).write_text(json.dumps(sums, indent=1) + "\n")
 
 
 def _facts(stage: str, out: Path, plan: Stage | DepthStage) -> dict[str, Any]:
