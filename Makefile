@@ -19,6 +19,11 @@ GATE := build/gate
 # Where LLVM is installed, each process of the tests would compile Mitsuba's integrators. The tests of LLVM choose their own variant.
 test test-all: export ATTNWARP_MITSUBA ?= scalar_rgb
 
+# What is compiled or checked once for all checkouts: kernels by the text of their sources (attnwarp/numba_cache.py), types.
+KEPT ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/attnwarp/checkouts
+test test-all gate baseline: export NUMBA_CACHE_DIR ?= $(KEPT)/kernels
+test test-all gate baseline: export NUMBA_CACHE_LOCATOR_CLASSES ?= attnwarp.numba_cache.BySource,InTreeCacheLocator,UserWideCacheLocator
+
 .PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean count
 
 ## an edit carried, what the mask is for, accuracy against time: runs/demo/report.html
@@ -63,7 +68,9 @@ docs: venv
 lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@[ -d .mypy_cache ] || tar -xf $(KEPT)/mypy.tar 2>/dev/null || rm -rf .mypy_cache
 	$(BIN)/mypy
+	-@mkdir -p $(KEPT) && tar -cf $(KEPT)/mypy.tar.$$$$ .mypy_cache && mv $(KEPT)/mypy.tar.$$$$ $(KEPT)/mypy.tar
 	$(BIN)/lint-imports
 	$(BIN)/python -m scripts.check_docstrings
 

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import sys
 import tempfile
+import time
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import yaml
+from llvmlite.binding import get_host_cpu_name
 
-import attnwarp.render
-from attnwarp.gaussians import Gaussians
-from attnwarp.losses import normal_consistency
-from benchmarks import render, warp
+from attnwarp import numba_cache
+
+if TYPE_CHECKING:
+    from attnwarp.gaussians import Gaussians
 
 STUDY = {
     "name": "kernels",
@@ -35,6 +39,8 @@ STUDY = {
 
 def main(float64: bool) -> None:
     """Call every kernel once, on a small case."""
+    from benchmarks import render, warp
+
     for kind in ("2d", "3d"):
         splats = render.scene(kind, 100, 0.1)
         render.time_once(in_double(splats) if float64 else splats, render.camera(32))
@@ -48,8 +54,30 @@ def main(float64: bool) -> None:
         scenes_and_truth(Path(folder))
 
 
+def once_for_all_checkouts(float64: bool) -> None:
+    """Do nothing where kernels are kept by their sources, and those of these sources are there.
+
+    Kernels of sources that nobody called for in 30 days are removed.
+    """
+    kept = Path(os.environ["NUMBA_CACHE_DIR"])
+    done = kept / numba_cache.KEY / f"{sys.version_info[:2]}-{get_host_cpu_name()}-{float64}"
+    if not done.exists():
+        main(float64)
+    with suppress(OSError):  # unwritable, so kernels lie beside their modules
+        done.parent.mkdir(parents=True, exist_ok=True)
+        done.touch()
+        os.utime(done.parent)
+        for folder in kept.iterdir():
+            if folder.stat().st_mtime < time.time() - 30 * 86400:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
 def consistency_of_normals(splats: Gaussians) -> None:
     """The loss's kernels, forward and backward."""
+    import attnwarp.render
+    from attnwarp.losses import normal_consistency
+    from benchmarks import render
+
     means = splats.means.clone().requires_grad_(True)
     view = attnwarp.render.render(
         dataclasses.replace(splats, means=means), render.camera(32), backend="cpu"
@@ -65,6 +93,8 @@ def in_double(splats: Gaussians) -> Gaussians:
 
 def scenes_and_truth(folder: Path) -> None:
     """Kernels of scenes and of the truth: a body, and a small study."""
+    import yaml
+
     from attnwarp_eval.scene.solids import Ellipsoid, mesh_body
     from attnwarp_eval.study import Store, load_study
     from attnwarp_eval.study.run import execute, plan
@@ -76,4 +106,5 @@ def scenes_and_truth(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main("float64" in sys.argv[1:])
+    by_source = "NUMBA_CACHE_LOCATOR_CLASSES" in os.environ
+    (once_for_all_checkouts if by_source else main)("float64" in sys.argv[1:])

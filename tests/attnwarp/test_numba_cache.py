@@ -1,14 +1,26 @@
 """Oracles: the file system, and a render where nothing can be written."""
 
+import ast
+import importlib.util
 import math
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 from attnwarp import numba_cache
+from attnwarp.render._kernels import (
+    backward,
+    binning,
+    ordering,
+    projection,
+    projection_backward,
+    rasterization,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,6 +69,88 @@ def test_a_cache_that_cannot_be_written_is_left_for_a_temporary_folder(monkeypat
     monkeypatch.setattr("os.getuid", lambda: own.stat().st_uid + 1)
     (tmp_path / f"attnwarp-{os.getuid()}-numba").mkdir()
     assert numba_cache.kernel_folder() is None
+
+
+def test_a_change_in_any_module_throws_cached_code_away(tmp_path):
+    """numba itself looks at the file of a function only, not at those of what was inlined into
+    it."""
+    sources = numba_cache.kernel_sources()
+    for path in sources:
+        copy = tmp_path / path.relative_to(numba_cache.HERE)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, copy)
+    assert numba_cache.kernel_key(tmp_path) == numba_cache.KEY
+    keys = {numba_cache.KEY}
+    for copy in numba_cache.kernel_sources(tmp_path):
+        copy.write_text(copy.read_text() + "\n")
+        keys.add(numba_cache.kernel_key(tmp_path))
+    assert len(keys) == len(sources) + 1 > 15
+    for dispatcher in (
+        rasterization.rasterize,
+        backward.rasterize_backward,
+        projection.project,
+        projection_backward.project_backward,
+        ordering.depths,
+        binning.find_runs,
+    ):
+        assert dispatcher._cache._cache_file._source_stamp == numba_cache.KEY
+
+
+def test_the_key_covers_all_text_that_kernels_use():
+    """A kernel uses names of its own module and, in a module of the key, of other such modules."""
+    sources = numba_cache.kernel_sources()
+    covered = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sources}
+    checked = 0
+    for path in [*ROOT.glob("attnwarp/**/*.py"), *ROOT.glob("eval/**/*.py")]:
+        text = path.read_text()
+        if "numba" not in text and path not in sources:
+            continue
+        tree = ast.parse(text)
+        of = {
+            alias.asname or alias.name: node.module
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("attnwarp")
+            for alias in node.names
+        }
+        for function in ast.walk(tree):
+            decorators = getattr(function, "decorator_list", [])
+            if not any(word in ast.unparse(d) for d in decorators for word in ("jit", *COMPILERS)):
+                continue
+            checked += 1
+            used = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+            others = {of[name] for name in used & of.keys()}
+            assert others - {"attnwarp.numba_cache"} <= (covered if path in sources else set()), (
+                path
+            )
+    assert checked > 100
+
+
+COMPILERS = ("bare", "inlined", "exact", "exact_inlined", "exact_pasted", "intrinsic", "overload")
+
+
+def test_checkouts_share_a_kernel_of_the_same_text_alone(monkeypatch, tmp_path):
+    """Oracle: numba's own counts of what was compiled, and of what came from disk."""
+    classes = "attnwarp.numba_cache.BySource,InTreeCacheLocator"
+    monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", classes)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    numba.config.reload_config()
+
+    def scaled(checkout, factor, key):
+        monkeypatch.setattr(numba_cache, "KEY", key)
+        path = tmp_path / checkout / "kernel.py"
+        path.parent.mkdir()
+        path.write_text(
+            f"import numba\n\n@numba.njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
+        )
+        spec = importlib.util.spec_from_file_location("attnwarp_of_a_test.kernel", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.f(1), sum(module.f.stats.cache_hits.values())
+
+    assert scaled("first", 2, "a") == (2, 0)
+    assert scaled("second", 2, "a") == (2, 1)
+    assert scaled("own_text_changed", 3, "a") == (3, 0)
+    assert scaled("others_text_changed", 2, "b") == (2, 0)
 
 
 def test_warp_takes_no_folder_of_another_user_either(monkeypatch, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,7 +14,7 @@ from numba.core import cgutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
-from attnwarp.numba_cache import CACHE
+from attnwarp.numba_cache import CACHE, KEY
 
 try:
     import fcntl
@@ -24,16 +23,6 @@ except ImportError:  # Windows
 
 # NaN and infinity are left to IEEE rules: selects rely on comparisons with them.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-def fingerprint(folder: Path = Path(__file__).parent) -> str:
-    """Hash all compiled code (SHA-256): the modules of ``folder``, and two of its parent."""
-    beside = [folder.parent / name for name in ("constants.py", "harmonics.py")]
-    files = [*sorted(folder.glob("*.py")), *beside]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-FINGERPRINT = fingerprint()
 
 
 def by_one_process(dispatcher: Any) -> Any:
@@ -81,7 +70,7 @@ def _compiled(**options: Any) -> Any:
         # There is no cache if numba's compilation is disabled.
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if file is not None:
-            file._source_stamp = FINGERPRINT
+            file._source_stamp = KEY
         return by_one_process(dispatcher)
 
     return decorate

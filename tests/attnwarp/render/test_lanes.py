@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
 from attnwarp.render._kernels import (
-    backward,
     binning,
-    compilation,
     lanes,
     layout,
-    ordering,
     projection,
-    projection_backward,
-    rasterization,
 )
 
 
@@ -164,28 +157,3 @@ def test_a_row_of_squares_as_bits(begin, end) -> None:
         )
     nothing = 32767 | -1 << 16
     assert binning._row_bits(nothing, 40) == binning._tile_bits(nothing, 40) == 0
-
-
-def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
-    """numba itself looks at the file of a function only, not at those of what was inlined into
-    it."""
-    render = tmp_path / "render"
-    here = Path(layout.__file__).parent
-    shutil.copytree(here, render / "_kernels")
-    for name in ("constants.py", "harmonics.py"):
-        shutil.copy(here.parent / name, render)
-    assert compilation.fingerprint(render / "_kernels") == compilation.FINGERPRINT
-    for name in ("_kernels/lanes.py", "constants.py", "harmonics.py"):
-        file = render / name
-        file.write_text(file.read_text() + "\n")
-        assert compilation.fingerprint(render / "_kernels") != compilation.FINGERPRINT
-        file.write_text(file.read_text()[:-1])
-    for dispatcher in (
-        rasterization.rasterize,
-        backward.rasterize_backward,
-        projection.project,
-        projection_backward.project_backward,
-        ordering.depths,
-        binning.find_runs,
-    ):
-        assert dispatcher._cache._cache_file._source_stamp == compilation.FINGERPRINT
