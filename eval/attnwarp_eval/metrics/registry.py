@@ -196,6 +196,7 @@ _SPECS = (
     Metric("fidelity.preserved_ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the unedited picture, outside the object"),
     Metric("fidelity.preserved_distance", "ratio", "lower", 1e-4, 1e-2, "distance to the unedited picture, outside the object"),
     Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
+    Metric("labels.net", "share", "higher", 1e-4, 0, "of tokens that the source truly shows, and hidden ones that take a part's label: right less wrong less painted, -1 to 1"),
     Metric("labels.right", "share", "higher", 1e-4, 0, "tokens that the source truly shows, and that take their own part's label"),
     Metric("labels.wrong", "share", "lower", 1e-4, 0, "of them, those that take another label"),
     Metric("labels.none", "share", "lower", 1e-4, 0, "of them, those that take nothing"),

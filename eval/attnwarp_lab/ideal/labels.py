@@ -6,6 +6,7 @@ docs/measuring/ideal-editor.md describes what the figures can and cannot decide.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import cv2
@@ -27,6 +28,9 @@ OUTSIDE = -1
 
 EDGE = 0.05
 """Relative depth step that counts as an edge."""
+
+FEWEST = 20
+"""Visible tokens below which a view has no net share: one token would move it by over 5 points."""
 
 
 class Layer(Protocol):
@@ -190,7 +194,13 @@ def label_transport(
     """Right, wrong and missing labels at visible tokens, and labels at other tokens.
 
     A token is visible if more than half of its pixels show its part and the source shows them;
-    hidden if more than half show its part and the source does not.
+    hidden if more than half show its part and the source does not. Tokens that are neither, as
+    those where the truth is ambiguous, count nowhere.
+
+    ``labels.net`` ranks warps. It is the mean, over visible tokens and hidden ones that take a
+    part, of +1 for the right label, 0 for none, and -1 for a wrong one or a part on a hidden token:
+    of V, R, W and P tokens (R - W - P) / (V + P), from -1 to 1. The truth has 1, nothing carried 0.
+    A share of right labels alone rewards a warp that also paints where it has to guess.
 
     Args:
         carried: (h, w) from :func:`carried_labels`.
@@ -201,6 +211,7 @@ def label_transport(
         among: (h, w) bool of the counted tokens; None for all.
 
     Returns:
+        ``labels.net``, NaN below :data:`FEWEST` visible tokens;
         ``labels.right``, ``labels.wrong`` and ``labels.none`` of visible tokens, which sum to 1;
         ``labels.painted_hidden`` of hidden tokens and ``labels.painted_outside`` of tokens outside
         the thing: those that take a part; and the counts ``labels.visible``, ``labels.hidden`` and
@@ -218,12 +229,22 @@ def label_transport(
         >>> figures = label_transport(carried, true, true, seen, ~seen)
         >>> figures["labels.right"], figures["labels.painted_hidden"]
         (1.0, 1.0)
+
+        Of 24 visible tokens 18 right and 3 wrong, of 4 hidden ones 2 painted: 13 / 26.
+
+        >>> true, seen = np.zeros((1, 28), np.int16), np.arange(28)[None] < 24
+        >>> carried = np.array([18 * [0] + 3 * [1] + 3 * [-2] + 2 * [0] + 2 * [-2]], np.int16)
+        >>> label_transport(carried, true, true, seen, ~seen)["labels.net"]
+        0.5
     """
     kinds = label_tokens(carried, tokens, pixels, visible, unseen)
     counts = {
         name: int((kind if among is None else kind & among).sum()) for name, kind in kinds.items()
     }
+    painted, enough = counts["painted_hidden"], counts["visible"] >= FEWEST
+    net = counts["right"] - counts["wrong"] - painted
     figures: dict[str, float] = {
+        "net": share(net, counts["visible"] + painted) if enough else math.nan,
         **{name: share(counts[name], counts["visible"]) for name in ("right", "wrong", "none")},
         "painted_hidden": share(counts["painted_hidden"], counts["hidden"]),
         "painted_outside": share(counts["painted_outside"], counts["outside"]),

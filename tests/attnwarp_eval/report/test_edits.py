@@ -17,7 +17,7 @@ def planted():
     cells = []
     for number, scene in enumerate(SCENES):
         for (edit, variant), right in RIGHT.items():
-            views = [(f"{edit}/yaw030", 30.0, {"labels.right": right + 0.01 * number})]
+            views = [(f"{edit}/yaw030", 30.0, {"labels.net": right + 0.01 * number})]
             data = written_runs.record(views, spec={"edit": {"name": edit}})
             name = f"{scene}-{edit}-{variant}"
             cells.append(written_runs.outcome("labels", scene, [variant], data, name))
@@ -27,7 +27,7 @@ def planted():
 def test_edits_of_opposite_signs_are_not_pooled():
     results = planted()
     compared = compared_of(results, [])
-    told = [[one.word for one in rows if one.metric == "labels.right"] for rows in compared]
+    told = [[one.word for one in rows if one.metric == "labels.net"] for rows in compared]
     assert told == [["better"], ["worse"]]
     (section,) = differences(results, compared)
     assert [table.caption for table in section.tables] == ["b: one", "b: several"]

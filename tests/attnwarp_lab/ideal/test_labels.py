@@ -8,6 +8,7 @@ import torch
 
 from attnwarp import Camera
 from attnwarp.warp import preset
+from attnwarp_eval.study.shared.controls import MovedView
 from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import world
 from attnwarp_lab.ideal.labels import (
@@ -98,6 +99,34 @@ def test_labels_are_those_of_a_loop_over_pixels(labels, grid, rules):
             assert figures[f"labels.painted_{name}"] == pytest.approx(
                 counts[f"painted_{name}"] / counts[name]
             )
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "painted", "net"),
+    [(24, 0, 0, 1.0), (0, 0, 0, 0.0), (0, 24, 0, -1.0), (20, 4, 8, 8 / 32), (18, 3, 0, 15 / 24)],
+)
+def test_net_labels_are_right_less_wrong_less_painted_by_hand(right, wrong, painted, net):
+    true, seen = np.zeros((1, 40), np.int16), np.arange(40)[None] < 24
+    carried = np.full((1, 40), NONE, np.int16)
+    carried[0, :right], carried[0, right : right + wrong], carried[0, 24 : 24 + painted] = 0, 1, 0
+    assert label_transport(carried, true, true, seen, ~seen)["labels.net"] == pytest.approx(net)
+    few = np.arange(40)[None] < 19
+    assert math.isnan(label_transport(carried, true, true, few, ~few)["labels.net"])
+
+
+def test_net_labels_of_the_truth_come_before_no_mask_and_both_before_a_mirror(labels):
+    of = world("spheres", 64)
+    pair = of.pair("yaw045", 64)
+    source, target = (token_parts(labels[name], (16, 16)) for name in ("source", "yaw045"))
+    every = warp_truth(of, pair, bounds_only())
+    exact = every.with_mask(torch.from_numpy(np.ascontiguousarray(pair.visible)))
+
+    def net(view):
+        carried = carried_labels(view.at((16, 16)), source)
+        got = label_transport(carried, target, labels["yaw045"], pair.visible, pair.unseen)
+        return got["labels.net"]
+
+    assert net(exact) > net(every) > net(MovedView.of(every, "mirrored"))
 
 
 def test_without_tokens_of_a_kind_a_share_is_undefined():

@@ -31,12 +31,13 @@ STUDY = {
     "things": {"spheres": THING},
     "variants": {
         "exact": {"geometry": "truth", "set": EXACT},
+        "exact mask": {"geometry": "truth", "mask": "truth"},
         "everywhere": {
             "geometry": "truth",
             "set": {"depth_spread": 0.02, "in_front": False, "depth_agreement": False, "normal_test": "none"},
         },
     },
-    "probes": {"labels": ["exact", "everywhere"]},
+    "probes": {"labels": ["exact", "exact mask", "everywhere"]},
     "ablations": [{"title": "Rules", "probe": "labels", "baseline": "exact", "variants": ["everywhere"]}],
 }  # fmt: skip
 
@@ -67,6 +68,21 @@ def test_a_cell_has_the_labels_of_its_warp_by_grid_and_parts(tmp_path):
                 assert got == value or (math.isnan(got) and math.isnan(value))
     # Without a grid in its name: tokens of 4 px, the first number of parts.
     assert view.metrics["labels.right"] == view.metrics["labels.right.16.6"]
+
+
+def test_an_exact_mask_carries_no_label_to_what_the_source_does_not_see(tmp_path):
+    """Oracle: by definition nothing that most pixels call hidden is painted, and nearly all that
+    is seen takes a label.
+    """
+    cells = cells_of(load(tmp_path), {"spheres": load_scene("spheres")})
+    views = {
+        c.variant: compute(probe("labels"), c, tmp_path).views[0].metrics
+        for c in cells
+        if c.probe == "labels"
+    }
+    exact = views["exact mask"]
+    assert exact["labels.painted_hidden"] == 0 < views["everywhere"]["labels.painted_hidden"]
+    assert exact["labels.none"] < 0.1 < views["exact"]["labels.none"]
 
 
 def test_the_report_tells_a_warp_without_rules_from_one_with_them(tmp_path):

@@ -7,6 +7,8 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Any
 
+import numpy as np
+import torch
 from pydantic import Field
 
 from attnwarp.warp import WarpedView, WarpSettings, warp_view
@@ -88,15 +90,16 @@ class LabelTransport(WarpProbe):
             yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Depth, rules, grids and parts; a control, and what the judgement of edges needs."""
-        edges, control = edges_of(study, self.name), variant.part(VariantPart).control
+        """Depth, rules, grids and parts; an exact mask, a control, and what edges need."""
+        edges, own = edges_of(study, self.name), variant.part(VariantPart)
         parts, further = study.part(StudyPart).labels.parts, dict[str, Any]()
-        if control is not None:
-            further["control"] = control
+        if own.mask == "truth":
+            further["mask"] = own.mask
+        if own.control is not None:
+            further["control"] = own.control
         if edges is not None and any(study.variants[name] == variant for name in edges.named):
-            own = {"parts": edges.parts or parts[0]}
-            own["chained"] = any(study.variants[name] == variant for name in edges.methods)
-            further["edges"] = own
+            chained = any(study.variants[name] == variant for name in edges.methods)
+            further["edges"] = {"parts": edges.parts or parts[0], "chained": chained}
         return {
             **super().variant_spec(study, variant, seed),
             "grids": grids_of(study, study.size),
@@ -105,8 +108,9 @@ class LabelTransport(WarpProbe):
         }
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Key of the depth, the rules and the control."""
-        return *super().meaning(study, variant), variant.part(VariantPart).control
+        """Key of the depth, the rules, the mask and the control."""
+        own = variant.part(VariantPart)
+        return *super().meaning(study, variant), own.mask, own.control
 
     def compute(self, work: Work) -> NoExtra:
         """Warp, carry and count, view by view."""
@@ -125,6 +129,8 @@ class LabelTransport(WarpProbe):
         fine = labels[edges["parts"]]
         source = chained = token_parts(fine[names[0]], (near, near))
         for link, (name, truth, view) in enumerate(warped_views(work, grids), 1):
+            if "mask" in spec:
+                view = view.with_mask(torch.from_numpy(np.ascontiguousarray(truth.visible)))
             if "control" in spec:
                 view = MovedView.of(view, spec["control"])
             layer, figures = view.at((near, near)), dict[str, float]()

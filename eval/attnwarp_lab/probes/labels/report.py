@@ -19,6 +19,11 @@ from attnwarp_lab.ideal.edges import edges_of
 RIGHT, HIDDEN = "labels.right.{}", "labels.painted_hidden.{}"
 """Figures of a row on depth edges."""
 
+TOKENS = (
+    "Only the net share, which the table above judges, ranks the truth first: the others describe"
+    " what it is made of."
+)
+
 
 @register_report
 class LabelReport(ProbeReport):
@@ -27,17 +32,28 @@ class LabelReport(ProbeReport):
     name = "labels"
     measures = "where labels of parts arrive"
     columns: ClassVar[Mapping[str, str]] = {
+        "net": "labels.net",
         "right": "labels.right",
         "wrong": "labels.wrong",
         "none": "labels.none",
         "painted, hidden": "labels.painted_hidden",
         "painted, outside": "labels.painted_outside",
     }
-    contrasts = ("labels.right", "labels.painted_hidden")
+    contrasts = ("labels.net",)
     stage = "pair"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """Errors at depth edges, from the source and from view to view."""
+        """What becomes of tokens, by variant; errors at depth edges, from the source and from view
+        to view.
+        """
+        names = dict.fromkeys(v for c, _ in results.finished(self.name) for v in c.variants)
+        rows = [
+            [n, *mean_values(results, self.name, n, self.columns.values())]
+            for n in results.study.variants
+            if n in names
+        ]
+        if rows:
+            yield Section("Tokens", [TOKENS], [Table(["variant", *self.columns], rows)])
         edges = edges_of(results.study, self.name)
         if edges is None:
             return
