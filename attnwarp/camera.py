@@ -27,6 +27,16 @@ well below it.
 EXACT_ROTATION = 1e-12
 """Largest error of a rotation that counts as float64 rounding and is kept bit for bit."""
 
+ROLL, UNSURE = np.radians(2), np.radians(5)
+"""Usual roll of a photograph, standard deviation, and largest standard error of a direction up that
+counts as known."""
+
+SIDEWAYS = 0.1
+"""Least amount by which the right axis leans more than the down axis in a picture on its side."""
+
+SENSE = 0.2
+"""Least mean of the pictures' up axes along the direction up that says which of its ends is up."""
+
 SAME_PLACE = 1e-12
 """Distance of two centres, over their coordinates, below which the distance is rounding."""
 
@@ -370,3 +380,44 @@ def meeting_point(cameras: Sequence[Camera]) -> npt.NDArray[np.float64] | None:
         return None
     offset = np.linalg.solve(system, np.einsum("nij,nj->i", across, centers - middle))
     return np.asarray(middle + offset)
+
+
+def up_of(cameras: Sequence[Camera]) -> tuple[npt.NDArray[np.float64], bool]:
+    """Estimate the upward direction from pictures that are level, or level on their side.
+
+    The direction is the one most orthogonal to all pictures' level edges: lower edges, or side
+    edges of pictures that were stored on their side. Most pictures decide which end is up. Pictures
+    that all look one way say this to the pitch alone, and pictures rolled at random say nothing;
+    the direction is then near the mean of the cameras' up axes.
+
+    Returns:
+        up: (3,), of length 1.
+        known: True if its standard error is at most :data:`UNSURE`, and the pictures' sense agrees.
+
+    Example:
+        >>> from attnwarp.camera import Camera, up_of
+        >>> view = dict(width=8, height=8, fov_y=40)
+        >>> side = [Camera.look_at((x, 3, 2), (0, 0, 0), **view) for x in (-2, -1, 0, 1, 2)]
+        >>> up, known = up_of(side)
+        >>> bool(up[2] > 0.999), known  # though all of them look down
+        (True, True)
+        >>> up_of(side[:1])[1]
+        False
+    """
+    axes = np.stack([camera.rotation[:2] for camera in cameras])
+    upright, count = -axes[:, 1].mean(0), len(axes)
+    up = upright
+    for _ in range(5):
+        right, down = np.abs(axes @ up).T
+        level = np.where((right > down + SIDEWAYS)[:, None], axes[:, 1], axes[:, 0])
+        values, vectors = np.linalg.eigh(level.T @ level / count)
+        up = vectors[:, 0]
+    # Variance of an eigenvector. Rolls of few pictures look smaller than they are.
+    small, large, _ = values.clip(ROLL**2)
+    found = bool(np.sqrt(small * large / count) < UNSURE * (large - small))
+    if not found:
+        right = axes[:, 0]
+        tilt = right.T @ right / count - 0.005 * np.outer(upright, upright)
+        up = np.linalg.eigh(tilt)[1][:, 0]
+    sense = float(up @ upright)
+    return np.asarray(up if sense >= 0 else -up), found and abs(sense) > SENSE

@@ -23,7 +23,7 @@ from attnwarp.fit.densify import Density
 from attnwarp.fit.exposure import Exposure
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
-from attnwarp.fit.start import extent_of
+from attnwarp.fit.start import extent_of, upward
 from attnwarp.fit.views import Views, warn_of_twins
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
@@ -259,6 +259,9 @@ class _Run:
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
+        up = upward(settings, views.cameras)
+        if up is not None:
+            self.model.keep_above(up, float((centers @ up).max()))
         middle = centers.mean(0) - self.model.origin
         self.density = Density(settings, self.extent, middle, len(start), self.model.device)
         self.exposure = Exposure(len(views), self.model.device) if settings.exposure else None

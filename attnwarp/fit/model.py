@@ -68,7 +68,11 @@ class Model:
         tensors: leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
+        floor: direction up, (3,), and least height of a sky splat along it from the origin, in
+            scene units; None sets no bound.
     """
+
+    floor: tuple[Tensor, float] | None = None
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
         self.settings, self.extent = settings, extent
@@ -140,11 +144,27 @@ class Model:
         value = 1.0 if choice == "white" else 0.0
         return torch.full((3,), value, dtype=torch.float32, device=self.device)
 
-    def _clamp_scales(self) -> None:
+    def keep_above(self, up: np.ndarray, height: float) -> None:
+        """Keep sky splats from sinking below a height along ``up``, (3,), or the lowest of them.
+
+        Args:
+            height: in world coordinates, such as that of the highest camera: no camera then sees
+                the sky below its horizon.
+        """
+        means = self.tensors["means"].detach()
+        direction = torch.tensor(up, dtype=torch.float32, device=self.device)
+        sky = means[means.norm(dim=1) > self.far] @ direction
+        self.floor = direction, min([height - float(up @ self.origin), *sky.tolist()])
+
+    def _clamp(self) -> None:
         largest = torch.tensor(math.log(LARGEST * self.extent), device=self.device)
         if math.isfinite(self.far):
             sky = self.tensors["means"].norm(dim=1, keepdim=True) > self.far
             largest = torch.where(sky, math.log(LARGEST_SKY * self.far), largest)
+            if self.floor is not None:
+                up, height = self.floor
+                low = (height - self.tensors["means"] @ up).clamp_min(0)[:, None]
+                self.tensors["means"].add_(torch.where(sky, low * up, 0.0))
         self.tensors["scales"].clamp_(math.log(SMALLEST * self.extent)).clamp_(max=largest)
 
     def step(self, progress: float) -> None:
@@ -169,7 +189,7 @@ class Model:
         self.steps += 1
         with torch.no_grad():
             if s.lr_scales:
-                self._clamp_scales()
+                self._clamp()
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:

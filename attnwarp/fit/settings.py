@@ -10,6 +10,7 @@ from attnwarp.losses import Distortion
 from attnwarp.settings import Count, Number, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
+Sky = Literal[True, False, "x", "-x", "y", "-y", "z", "-z"]
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,9 @@ class FitSettings(Settings):
         reset_opacity: opacity after a reset, in (0, 1).
         antialiased: True fits "3d" splats for the opacity-compensated rasteriser.
         near: near-plane depth, as a share of the extent.
-        sky: True adds far splats to the first ones, for pictures without transparency; see
-            :func:`attnwarp.fit.with_sky`.
+        sky: True adds far splats to the first ones above the horizon, for pictures without
+            transparency whose cameras tell the direction up; an axis of the world, such as "z" or
+            "-y", is that direction; see :func:`attnwarp.fit.with_sky`.
         exposure: True fits an affine change of colour for each picture, absent from renders.
         evaluate_every: number of iterations between two evaluations on the held-out views, which
             also form the history.
@@ -112,7 +114,7 @@ class FitSettings(Settings):
     reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # keeps the logit finite
     antialiased: bool = False
     near: Annotated[float, Range(1e-9)] = 0.01
-    sky: bool = True
+    sky: Sky = True
     exposure: bool = False
     evaluate_every: Count = 500
     patience: Count | None = None

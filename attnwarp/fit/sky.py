@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp.camera import Camera
+from attnwarp.camera import up_of
 from attnwarp.devices import on_cpu_unless_named
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of, usual_distance
@@ -25,10 +26,16 @@ stand half of that usual distance apart see them shifted by a tenth of a degree,
 DIRECTIONS = 2000
 """First sky splats around the whole sphere, 4.5 degrees apart; a fit splits those with detail."""
 
-CELLS = 16
-"""Cells along a picture's side. One without a first splat in it or above it shows sky: a ground
-without texture has none either. In a picture of 70 degrees a cell is as wide as the shell's splats
-are apart."""
+MARGIN = np.radians(5)
+"""Least elevation of a first sky splat: up is known to as much, and splats are as wide."""
+
+SECTORS = 80
+"""Sectors of the horizon, as wide as the first sky splats are apart. The highest first splat in one
+hides the sky below it: a ground without texture has no first splats either."""
+
+ABOVE = np.radians(2.25)
+"""Least elevation of a first sky splat above that of the highest first splat in its sector, half of
+what the sky splats are apart: surfaces end above their highest point."""
 
 BAND = 0.1
 """Width of the band around a picture whose directions get a splat, in sides."""
@@ -48,45 +55,54 @@ OPACITY = 0.9
 
 
 @on_cpu_unless_named
-def with_sky(start: Gaussians, views: Views) -> Gaussians:
-    """Add a shell of far splats to a fit's first ones, wherever a picture shows none of these up to
-    its upper edge.
+def with_sky(start: Gaussians, views: Views, up: npt.ArrayLike | None = None) -> Gaussians:
+    """Add a shell of far splats to a fit's first ones, above the horizon, where a picture shows
+    none of these there or higher up.
 
     A sky splat has the median colour of those pictures in its direction.
 
     Args:
         start: first splats, at least one.
         views: pictures to fit on.
+        up: (3,) direction up, of length 1; by default what the cameras tell
+            (:func:`attnwarp.camera.up_of`).
 
     Returns:
         Splats with ``far`` set at half of the shell's distance. ``start`` itself if it has a sky,
-        if it is seen everywhere, and for pictures with transparency, whose background is known.
+        if no picture shows one, if the direction up is not known, and for pictures with
+        transparency, whose background is known.
 
     Example:
         >>> import numpy as np
         >>> from attnwarp.fit import Views, from_points, with_sky
         >>> from attnwarp.trial import view
         >>> blue = Views([view(side=16), view(3, 0, 16)], [np.full((16, 16, 3), [0, 0, 1.0])] * 2)
-        >>> start = with_sky(from_points(np.eye(3), kind="3d"), blue)
+        >>> start = with_sky(from_points(np.eye(3)[:2], kind="3d"), blue, up=(0, 1, 0))
         >>> start.far > 100, start.sh[-1, 0].sign().tolist()
         (True, [-1.0, -1.0, 1.0])
     """
-    if views.transparent or np.isfinite(start.far):
+    known = True
+    if up is None:
+        up, known = up_of(views.cameras)
+    if views.transparent or np.isfinite(start.far) or not known:
         return start
     middle = np.stack([camera.position for camera in views.cameras]).mean(0)
-    radius = SHELL * usual_distance(start.world_means(), views.cameras)
-    toward = directions(DIRECTIONS)
-    places = middle + radius * toward
     points = start.world_means()
-    seen = np.full((len(views), DIRECTIONS, 3), np.nan, np.float32)
+    radius = SHELL * usual_distance(points, views.cameras)
+    frame = _frame(np.asarray(up, dtype=np.float64))
+    toward = directions(DIRECTIONS)
+    toward = toward[toward @ frame[2] > math.sin(MARGIN)]
+    places = middle + radius * toward
+    sector, height = _around(frame, toward)
+    seen = np.full((len(views), len(toward), 3), np.nan, np.float32)
     for k, camera in enumerate(views.cameras):
-        scene = np.zeros((CELLS, CELLS), bool)
-        scene[_cells(camera, points)[1]] = True
-        scene = np.logical_or.accumulate(scene, axis=0)  # and what lies below a first splat
-        inside, cell = _cells(camera, places, BAND)
-        inside[inside] = ~scene[cell]
+        tops = np.full(SECTORS, -np.inf)
+        np.maximum.at(tops, *_around(frame, points - camera.position))
         size = np.array([camera.width, camera.height])
-        column, row = camera.project(places[inside])[0].clip(0, size - 1).astype(int).T
+        xy, z = camera.project(places)
+        inside = (z > 0) & (np.abs(xy / size - 0.5) < 0.5 + BAND).all(1)
+        inside &= height > tops[sector] + ABOVE
+        column, row = xy[inside].clip(0, size - 1).astype(int).T
         picture = views.target(k, torch.zeros(3, dtype=torch.float32))
         kept = views.kept(k, picture.device)
         if kept is not None:
@@ -171,15 +187,18 @@ def say_without_surface(share: float) -> str:
     )
 
 
-def _cells(
-    camera: Camera, points: Array, band: float = 0.0
-) -> tuple[npt.NDArray[np.bool_], tuple[npt.NDArray[np.intp], ...]]:
-    """Select the points that a picture shows, (P,) bool, and find the cell of each: row, column."""
-    xy, z = camera.project(points)
-    place = xy / [camera.width, camera.height]
-    shown = (z > 0) & (np.abs(place - 0.5) < 0.5 + band).all(1)
-    column, row = (place[shown].clip(0, 1 - 1e-9) * CELLS).astype(np.intp).T
-    return shown, (row, column)
+def _frame(up: Array) -> Array:
+    """Two horizontal axes and the direction up, (3, 3) by rows."""
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(up, east), up])
+
+
+def _around(frame: Array, offsets: Array) -> tuple[npt.NDArray[np.intp], Array]:
+    """Find the sector of the horizon, (P,), and the elevation in radians, (P,), of directions."""
+    east, north, up = frame @ offsets.T
+    turn = np.arctan2(north, east) / (2 * np.pi) % 1
+    return (turn * SECTORS).astype(np.intp) % SECTORS, np.arctan2(up, np.hypot(east, north))
 
 
 def directions(count: int) -> Array:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
-from attnwarp.camera import Camera, meeting_point
+from attnwarp.camera import Camera, meeting_point, up_of
 from attnwarp.devices import on_cpu_unless_named
 from attnwarp.gaussians import Gaussians, Kind
 
@@ -227,7 +227,8 @@ def first_splats(
         settings: kind, degree, seed and largest number of the splats; of more, as many are drawn
             at random, and widened.
         report: receiver of a line if random points are used, if points lie too far away
-            (:func:`within_reach`), or if there are more than ``max_splats``.
+            (:func:`within_reach`), if no direction up is known for a sky, or if there are more
+            than ``max_splats``.
         random: number of random points.
         views: fitted pictures, which give the sky its colours; None begins without a sky.
 
@@ -263,10 +264,18 @@ def first_splats(
         seed=settings.seed,
         cameras=cameras,
     )
-    if views is not None and settings.sky:
+    if views is not None and settings.sky and not views.transparent:
         from attnwarp.fit.sky import with_sky
 
-        start = with_sky(start, views)
+        up = upward(settings, cameras)
+        if up is None:
+            report.log(
+                "no sky is added: the cameras do not tell which way is up, as they look one way or"
+                " straight down, or are rolled; if an axis of the world points up, name it, such as"
+                " --set sky=z"
+            )
+        else:
+            start = with_sky(start, views, up)
     most = settings.max_splats
     if most is None or len(start) <= most:
         return start
@@ -275,6 +284,23 @@ def first_splats(
     # Fewer splats cover the same surface.
     wider = start.scales * math.sqrt(len(start) / most)
     return replace(start, scales=wider).select(drawn[:most].sort().values)
+
+
+def upward(settings: FitSettings, cameras: Sequence[Camera]) -> Array | None:
+    """Direction up, (3,): the axis that the settings name, or what the cameras tell
+    (:func:`attnwarp.camera.up_of`); None if that is not known.
+
+    Example:
+        >>> from attnwarp.fit import FitSettings
+        >>> from attnwarp.fit.start import upward
+        >>> upward(FitSettings(sky="-y"), []).tolist()
+        [-0.0, -1.0, -0.0]
+    """
+    if isinstance(settings.sky, str):
+        sign = -1.0 if settings.sky[0] == "-" else 1.0
+        return sign * np.eye(3)["xyz".index(settings.sky[-1])]
+    up, known = up_of(cameras)
+    return up if known else None
 
 
 def random_points(

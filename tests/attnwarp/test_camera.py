@@ -12,6 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
+from attnwarp.camera import up_of
 
 K = np.array([[500.0, 2.0, 330.0], [0.0, 480.0, 215.0], [0.0, 0.0, 1.0]])
 
@@ -223,3 +224,38 @@ def test_a_pose_from_camera_to_world_projects_as_opencv_does(rows, tensors):
 def test_a_pose_that_is_none_is_refused(matrix, axes, message):
     with pytest.raises(ValueError, match=message):
         Camera.from_c2w(matrix, K, 8, 8, axes=axes)
+
+
+def ring(count, elevation, arc=360.0, rolls=(0,)):
+    """Cameras on an arc about the origin, which they see from this elevation, in degrees; the
+    pictures rolled by these angles in turn."""
+    result = []
+    for k, yaw in enumerate(np.radians(arc) * np.arange(count) / count):
+        low = np.radians(elevation)
+        place = [3 * np.cos(yaw) * np.cos(low), 3 * np.sin(yaw) * np.cos(low), 3 * np.sin(low)]
+        level = Camera.look_at(place, (0, 0, 0), width=8, height=8, fov_y=50)
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("z", rolls[k % len(rolls)], degrees=True).as_matrix()
+        result.append(Camera(level.K, turn @ level.world_to_camera, 8, 8))
+    return result
+
+
+@pytest.mark.parametrize("elevation", [0, 30, 45])
+@pytest.mark.parametrize("rolls", [(0,), (0, 90), (0, 0, 180), (0, -90, 0, 90), (1, -1, 2, -2)])
+def test_level_pictures_tell_which_way_is_up_even_if_some_stand_on_their_side(elevation, rolls):
+    """Oracle: the cameras were placed with z up; rolls of both signs cancel to a degree."""
+    up, known = up_of(ring(24, elevation, rolls=rolls))
+    assert known and up[2] > np.cos(np.radians(1))
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        ring(8, 40, arc=0), ring(8, 40, arc=5), ring(1, 0), ring(24, 89),
+        ring(24, 20, rolls=(90,)), ring(24, 20, rolls=(10, 100, 55, 200, -50, 300, 150)),
+    ],
+    ids=["one way", "nearly one way", "one", "straight down", "all on their side", "any roll"],
+)  # fmt: skip
+def test_pictures_that_do_not_tell_which_way_is_up_say_so(cameras):
+    up, known = up_of(cameras)
+    assert not known and np.linalg.norm(up) == pytest.approx(1)

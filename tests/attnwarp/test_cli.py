@@ -872,6 +872,8 @@ def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
     assert done.exit_code == 0, done.stderr
     vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
     np.testing.assert_allclose(vertex["scale_2"], np.log(1e-5), rtol=1e-6)
+    # Splats that begin at an opacity of 0.1 hide nothing.
+    assert "% of the pictures' area has no surface" in done.stdout
     # World coordinates: the blobs are scattered by 0.4 about zero.
     assert abs(np.mean(vertex["x"])) < 0.5
     done = in_process("fit", data, "--out", tmp_path, "--kind", "3dgs", "--third-scale", "1e-5")

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.camera import up_of
 from attnwarp.command.page.measured import CONTROL, disagreement, edited_alone, spill
 from attnwarp.command.page.turntable import (
     degrees_apart,
     focus_of,
     orbit,
     renders,
-    up_of,
     write_film,
 )
 from attnwarp.editing.editor import Editor
@@ -202,7 +202,7 @@ class _Page:
             "position": (camera.position - origin).tolist(),
             "rotation": camera.rotation.T.tolist(),
             "focus": (self.focus - origin).tolist(),
-            "up": up_of(self.cameras).tolist(),
+            "up": up_of(self.cameras)[0].tolist(),
             "near": near_of(self.cameras, self.after),
         }  # fmt: skip
         return (

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.camera import Camera, meeting_point
+from attnwarp.camera import Camera, meeting_point, up_of
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.file import write_atomically
@@ -78,7 +78,7 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
     Returns:
         :data:`FRAMES` cameras; the last leads to the first.
     """
-    focus, up = focus_of(cameras, points), up_of(cameras)
+    focus, up = focus_of(cameras, points), up_of(cameras)[0]
     ahead = focus - cameras[first].position
     east = ahead - (ahead @ up) * up
     east = _unit(
@@ -114,24 +114,6 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
             )
         )  # fmt: skip
     return result
-
-
-def up_of(cameras: Sequence[Camera]) -> Array:
-    """Estimate the upward direction, (3,) of length 1: across the pictures' lower edges, which a
-    level camera keeps level, or, if these do not determine it, the mean of the cameras' up axes.
-
-    Example:
-        >>> from attnwarp import Camera
-        >>> view = dict(width=8, height=8, fov_y=40)
-        >>> side = [Camera.look_at((x, 3, 2), (0, 0, 0), **view) for x in (-2, 0, 2)]
-        >>> bool(up_of(side)[2] > 0.999)  # though all of them look down
-        True
-    """
-    level = np.stack([camera.rotation[0] for camera in cameras])
-    upright = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
-    tilt = level.T @ level / len(level) - 0.005 * np.outer(upright, upright)
-    up = np.linalg.eigh(tilt)[1][:, 0]
-    return np.asarray(up if up @ upright >= 0 else -up)
 
 
 def _unit(vector: Array) -> Array:

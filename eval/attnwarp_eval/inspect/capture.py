@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import Camera, Gaussians
+from attnwarp.camera import up_of
 from attnwarp.errors import InputError, suggest
 from attnwarp.io import Dataset, read_image, read_ply
 from attnwarp.io.names import file_stems
@@ -63,14 +64,14 @@ class Capture:
         source = names[0] if source is None else source
         one_of(source, names, "source")
         # Import here: the fit's losses and networks import slowly.
-        from attnwarp.command.page.turntable import focus_of, up_of
+        from attnwarp.command.page.turntable import focus_of
         from attnwarp.methods.scene import near_of
 
         self.near = near_of(cameras, model)
         self.names = names
         self.source = cameras[names.index(source)]
         self.targets = {camera.name: camera for camera in cameras if camera.name != source}
-        self.center, self.up = focus_of(cameras, model.world_means()), up_of(cameras)
+        self.center, self.up = focus_of(cameras, model.world_means()), up_of(cameras)[0]
         self.image: Callable[[str], Image] = cache(self._image)
         self._rendered: Callable[..., Surface] = cache(self._render)
 

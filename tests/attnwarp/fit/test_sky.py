@@ -6,10 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from edit_folders import Watched
 
 from attnwarp import Camera, Gaussians
-from attnwarp.fit import FitSettings, Views, fit, from_points, with_sky, without_surface
+from attnwarp.fit import (
+    FitSettings,
+    Views,
+    first_splats,
+    fit,
+    from_points,
+    with_sky,
+    without_surface,
+)
 from attnwarp.fit.model import LARGEST
+from attnwarp.io import Dataset
 from attnwarp.render import render
 
 SIZE = 64
@@ -82,6 +92,74 @@ def test_a_sky_takes_colour_and_no_depth():
     error = view.color[sky] - torch.from_numpy(shots[5][0])[sky]
     assert shares[1] < 0.5 * shares[0] and solids[1] > 0.8 * solids[0], (shares, solids)
     assert float(error.abs().mean()) < 0.06  # half of the clouds' contrast
+
+
+def from_above():
+    """17 cameras around the origin that look down at it by 50 degrees, and 300 points near it."""
+    turns = 2 * np.pi * np.arange(17) / 17
+    places = np.stack([5 * np.cos(turns), 5 * np.sin(turns), np.full(17, 6.0)], 1)
+    ring = [Camera.look_at(place, (0, 0, 0), width=SIZE, height=SIZE, fov_y=60) for place in places]
+    return ring, np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [1, 1, 0]
+
+
+def test_pictures_from_above_have_no_sky_however_few_points_their_lawn_has():
+    ring, middle = from_above()
+    views = Views(ring, [photograph(camera)[0] for camera in ring])
+    start = from_points(middle, kind="2d", sh_degree=0)
+    assert with_sky(start, views) is start
+
+
+def sky_of(rolls):
+    """Directions, (P, 3), and colours, (P, 3), of the first sky of pictures that stand on their
+    side after so many quarter turns, in turn."""
+    turned, shots = [], []
+    for k, camera in enumerate(cameras()):
+        quarter = rolls[k % len(rolls)]
+        turn = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), quarter)
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        turned.append(Camera(camera.K, pose @ camera.world_to_camera, SIZE, SIZE))
+        shots.append(np.rot90(photograph(camera)[0], quarter).copy())
+    start = with_sky(from_points(points(), kind="2d", sh_degree=0), Views(turned, shots))
+    return start.world_means()[1800:] / start.far, start.sh[1800:, 0].numpy()
+
+
+@pytest.mark.parametrize("rolls", [(0, 0, 2), (0, 1, 0, 0), (0, 3, 0)])
+def test_pictures_on_their_side_or_upside_down_have_the_sky_of_upright_ones(rolls):
+    """Oracle: rolled about its axis, a camera sees the same things, turned; the shell is above the
+    horizon, and the wall, 3 high 9 ahead of cameras 1 above the ground, hides 12 degrees of it."""
+    (places, colors), (same, alike) = sky_of((0,)), sky_of(rolls)
+    assert np.allclose(places, same) and np.allclose(colors, alike, atol=1e-6)
+    around, height = np.degrees(np.arctan2(places[:, 0], places[:, 1])), places[:, 2] / 2
+    assert len(places) > 40 and height.min() > math.sin(math.radians(4))
+    assert height[np.abs(around) < 20].min() > math.sin(math.radians(12))
+
+
+def test_a_fit_whose_cameras_do_not_tell_up_has_a_sky_only_where_the_settings_name_an_axis():
+    same_way = [
+        Camera.look_at((x, 0, 1), (x, 5, 2), width=SIZE, height=SIZE, fov_y=49) for x in (0, 1, 2)
+    ]
+    views = Views(same_way, [photograph(camera)[0] for camera in same_way])
+    data, said = Dataset(same_way, ["a.png", "b.png", "c.png"], points()), []
+
+    def first(sky):
+        settings = FitSettings(sky=sky, sh_degree=0)
+        return first_splats(data, same_way, settings, Watched(log=said.append), views=views)
+
+    assert math.isinf(first(True).far) and "--set sky=z" in said.pop()
+    assert len(first("z")) > 1800 == len(first("-z")) and not said
+
+
+def test_no_splat_of_the_sky_sinks_below_the_highest_camera():
+    """Steps as long as the lowest ones are high carry splats anywhere, the scene's too."""
+    views = Views(cameras(), [photograph(camera)[0] for camera in cameras()])
+    start = with_sky(from_points(points(), kind="2d", sh_degree=0), views)
+    settings = FitSettings(
+        iterations=3, sh_degree=0, lr_means=30.0, lr_means_final=30.0, densify=False
+    )
+    means = fit(start, views, settings).gaussians.world_means()
+    highest = max(camera.position[2] for camera in cameras())
+    assert means[1800:, 2].min() > highest - 1e-3 > means[:1800, 2].min()
 
 
 @pytest.mark.slow

@@ -30,14 +30,20 @@ horizon, which cells of the pictures decide."""
 
 
 def _before_a_horizon(roll: float, pitch: float) -> Views:
-    """Three pictures of a ground of one colour under a sky of another, turned about their axes."""
+    """Nine pictures of a ground of one colour under a sky of another, every third of them turned
+    about its axis."""
     views = []
-    for x in (0.0, 0.5, 1.0):
-        forward = (math.cos(pitch), math.sin(pitch))
+    for k, yaw in enumerate(np.radians(np.linspace(-40, 40, 9))):
+        ahead = (math.cos(pitch) * math.sin(yaw), math.cos(pitch) * math.cos(yaw))
+        place = (k / 8, 0, 1)
         level = Camera.look_at(
-            (x, 0, 1), (x, forward[0], 1 + forward[1]), width=SIZE, height=SIZE, fov_y=50
+            place,
+            (place[0] + ahead[0], ahead[1], 1 + math.sin(pitch)),
+            width=SIZE,
+            height=SIZE,
+            fov_y=50,
         )
-        angle, turn = math.radians(roll), np.eye(4)
+        angle, turn = math.radians(roll if k % 3 == 0 else 0), np.eye(4)
         turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
         views.append(Camera(level.K, turn @ level.world_to_camera, SIZE, SIZE))
     rays = [camera.directions() @ camera.rotation for camera in views]
