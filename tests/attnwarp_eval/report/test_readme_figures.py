@@ -17,11 +17,11 @@ ANSWER = ("editing", "multiview.same_answer.edit")
 APART = ("editing", "multiview.delta_e_above.edit_inside")
 
 SENTENCES = [
-    ("fitted", SEEN, ["2DGS fit, extended"], "`extended` brings [{:.0%}]"),
-    ("fitted", SEEN, ["2DGS fit", "3DGS fit, extended", "3DGS fit"], "`corrected` {:.0%} (3DGS: {:.0%} and {:.0%})"),
-    ("fitted", SEEN, ["2DGS fit, each view alone"], "each view alone {:.0%}, `extended` with exact"),
-    ("fitted", SEEN, ["exact depth and mask"], "exact depth and mask {:.0%} (24 scenes"),
-    ("fitted", KEPT, ["2DGS fit, tolerant", "2DGS fit"], "mask keeps {:.0%} of what is visible there, that of `corrected` {:.0%}"),
+    ("fitted/undensified", SEEN, ["2DGS fit, extended"], "`extended` brings [{:.0%}]"),
+    ("fitted/undensified", SEEN, ["2DGS fit", "3DGS fit, extended", "3DGS fit"], "`corrected` {:.0%} (3DGS: {:.0%} and {:.0%})"),
+    ("fitted/undensified", SEEN, ["2DGS fit, each view alone"], "each view alone {:.0%}, `extended` with exact"),
+    ("fitted/undensified", SEEN, ["exact depth and mask"], "exact depth and mask {:.0%} (24 scenes"),
+    ("fitted/undensified", KEPT, ["2DGS fit, tolerant", "2DGS fit"], "mask keeps {:.0%} of what is visible there, that of `corrected` {:.0%}"),
     ("ablation", ANSWER, ["shared: corrected"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
     ("ablation", ANSWER, ["shared: each view alone"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
     ("ablation", APART, ["shared: each view alone", "shared: corrected"], "differ more alone, by {:.1f} for {:.1f} dE00"),
