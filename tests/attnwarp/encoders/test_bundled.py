@@ -4,6 +4,7 @@ identity and order demand.
 
 import hashlib
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -37,12 +38,20 @@ SHORT = {
 """Figures that miss what was asked by more than chance, as the card says."""
 
 
+UNSEEN = Split(90_000_000, 12, pairs="any", new_shapes=True)
+"""Two views and three looks of worlds whose seeds no recipe uses, of shapes that training never
+sees.
+"""
+
+
 @pytest.fixture(scope="module")
 def worlds():
-    """Two views and three looks of worlds whose seeds no recipe uses, of shapes that training never
-    sees.
-    """
-    return _rendered(Split(90_000_000, 12, pairs="any", new_shapes=True))
+    return _rendered(UNSEEN)
+
+
+@pytest.fixture(scope="module")
+def few_worlds():
+    return _rendered(replace(UNSEEN, worlds=4))
 
 
 def _rendered(split):
@@ -147,6 +156,7 @@ def test_a_picture_and_its_mirror_image_say_the_same(clip):
     assert np.allclose(a, b, atol=1e-5 * np.abs(a).max())
 
 
+@pytest.mark.slow
 def test_things_colours_and_times_are_named(clip, worlds):
     few = Pictures(*(column[:6] for column in vars(worlds).values()))  # not looked at
     sets = {"test": worlds, "test-new-pairs": few, "test-rendered": few}
@@ -209,8 +219,10 @@ def test_the_gradient_of_unit_features_is_that_of_differences():
     assert torch.autograd.gradcheck(_Unit.apply, features.requires_grad_())
 
 
-def test_the_distance_is_zero_for_equal_pictures_symmetric_and_grows_with_blur(perceptual, worlds):
-    picture = worlds.images[3].astype(np.float32) / 255
+def test_the_distance_is_zero_for_equal_pictures_symmetric_and_grows_with_blur(
+    perceptual, few_worlds
+):
+    picture = few_worlds.images[3].astype(np.float32) / 255
     blurred = [
         np.clip(cv2.GaussianBlur(picture, (0, 0), s), 0, 1) for s in (0.7, 1.2, 2.0, 3.5, 6.0)
     ]
@@ -224,9 +236,11 @@ def test_the_distance_is_zero_for_equal_pictures_symmetric_and_grows_with_blur(p
         assert perceptual.distance([odd], [odd + 0.3])[0] > 0
 
 
-def test_a_small_shift_weighs_less_than_a_blur_which_squared_errors_get_wrong(perceptual, worlds):
+def test_a_small_shift_weighs_less_than_a_blur_which_squared_errors_get_wrong(
+    perceptual, few_worlds
+):
     right = {"ours": 0, "PSNR": 0}
-    chosen = worlds.images[::10]
+    chosen = few_worlds.images[::3]
     for image in chosen:
         # Fine grain all over: a shift by a pixel changes nearly every value.
         noise = np.random.default_rng(0).normal(0, 0.12, (160, 160, 1))

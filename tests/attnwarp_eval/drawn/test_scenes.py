@@ -70,10 +70,10 @@ def test_the_colour_asked_for_is_one_that_training_never_shows_the_thing_in():
 
 
 def test_a_drawn_file_loads_with_every_edit_and_sees_its_first_thing_from_everywhere(tmp_path):
-    done = CliRunner().invoke(app, ["scenes", "draw", "6", "--seed", "21", "--out", str(tmp_path)])
+    done = CliRunner().invoke(app, ["scenes", "draw", "3", "--seed", "21", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
-    assert "6 scenes drawn by generator 1, seed 21" in done.output
-    for k in range(6):
+    assert "3 scenes drawn by generator 1, seed 21" in done.output
+    for k in range(3):
         scene = load_scene(tmp_path / f"drawn-{k}.yaml")
         assert [edit.name for edit in scene.edits] == EDITS
         assert [len(edit.answers) for edit in scene.edits] == [0, 0, 0, 0, 0, 0, 6, 4]
