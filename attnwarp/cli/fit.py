@@ -192,11 +192,20 @@ def _warn_of_overfit(result: Fit) -> None:
     best, last = result.kept.choosing, result.history[-1].choosing
     if best is None or last is None or best <= last + OVERFITTED:
         return
+    remedy = (
+        "the fit learns its pictures by heart; take more of them"
+        if _has_grown(result)
+        else "no splat was added; take more --iterations or --max-splats"
+    )
     warn(
         f"the splats of {result.kept.iteration} iterations are kept: views that choose had"
-        f" {best:.2f} dB then, and {last:.2f} in the end: the fit learns its pictures by heart;"
-        " take more of them"
+        f" {best:.2f} dB then, and {last:.2f} in the end: {remedy}"
     )
+
+
+def _has_grown(result: Fit) -> bool:
+    """Return True if splats were added to the first ones, or were not to be."""
+    return not result.settings.densify or result.kept.splats > result.history[0].splats
 
 
 def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:
@@ -235,7 +244,7 @@ def _fit(
     """
     import attnwarp.fit
     from attnwarp.devices import choose
-    from attnwarp.fit.loop import CHECKPOINT, SPLATS
+    from attnwarp.fit.loop import CHECKPOINT, LEAST_CHOOSING, SPLATS, choosing
     from attnwarp.fit.start import FIRST_POINTS
     from attnwarp.io.names import file_stems
 
@@ -273,6 +282,11 @@ def _fit(
     settings = attnwarp.fit.FitSettings.from_dict(
         {"max_splats": most, "patience": PATIENCE if held_out else None, **changes}
     )
+    if held_out and settings.patience and not choosing(len(held_out), settings):
+        report.log(
+            f"held-out views: {len(held_out)}, too few to choose by; all iterations are done and"
+            f" the last splats kept; hold out {LEAST_CHOOSING + 1} or more to stop early"
+        )
     first = first.to(device=device)
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -292,7 +306,8 @@ def _fit(
     if line := attnwarp.fit.say_without_surface(share):
         typer.echo(line)
     seen = views if held_out is None else held_out
-    if line := attnwarp.fit.say_unlike(*attnwarp.fit.beside_mean_color(result.gaussians, seen)):
+    unlike = attnwarp.fit.beside_mean_color(result.gaussians, seen)
+    if line := attnwarp.fit.say_unlike(*unlike, grown=_has_grown(result)):
         warn(line)
     return result
 

@@ -30,6 +30,10 @@ GROW_SCALE = 0.01
 SPLIT_SHRINK = 1.6
 """Shrink factor of the two halves of a split splat (published)."""
 
+RECOVERY = 100
+"""Iterations after a reset in which no opacity is reason to go (published: the next refinement is
+100 later); Adam needs 40 of them from the reset's opacity to the floor of 2DGS."""
+
 
 def screen_gradient(
     gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float
@@ -62,7 +66,7 @@ def screen_gradient(
 
 
 class Density:
-    """Collector of gradients that adds and removes splats every ``densify_every`` iterations.
+    """Collector of gradients that adds and removes splats at intervals of ``densify_every``.
 
     Attributes:
         total, seen: (N,) sum of the gradients' lengths since the last refinement, and number of
@@ -80,7 +84,10 @@ class Density:
         self.settings, self.extent = settings, extent
         self.center = torch.tensor(np.asarray(center, dtype=np.float32), device=device)
         self.clear(count)
-        self.last = int(settings.densify_until * settings.iterations)
+        iterations = settings.iterations
+        self.last = int(settings.densify_until * iterations)
+        self.every = max(settings.densify_least, round(settings.densify_every * iterations))
+        self.reset = max(settings.reset_least, round(settings.reset_every * iterations))
 
     def clear(self, count: int) -> None:
         """Forget the gradients; ``count``: number of splats."""
@@ -109,13 +116,14 @@ class Density:
         if not self.active(iteration):
             return False
         done = False
-        if iteration >= s.densify_from and iteration % s.densify_every == 0:
+        if iteration >= s.densify_from * s.iterations and iteration % self.every == 0:
             # Published: after the first opacity reset, which a short fit lacks. By half of the
             # time, initially too large splats have been split or have shrunk.
-            sizes_count = iteration > min(s.reset_every, self.last / 2)
-            self._grow_and_prune(model, sizes_count, random)
+            sizes_count = iteration > min(self.reset, self.last / 2)
+            recovered = iteration <= self.reset or iteration % self.reset >= RECOVERY
+            self._grow_and_prune(model, sizes_count, recovered, random)
             done = True
-        if iteration % s.reset_every == 0:
+        if iteration % self.reset == 0:
             model.lower_opacity(s.reset_opacity)
             done = True
         return done
@@ -125,13 +133,15 @@ class Density:
         away = (model.tensors["means"].detach() - self.center).norm(dim=1)
         return away.clamp_min(self.extent)
 
-    def _grow_and_prune(self, model: Model, sizes_count: bool, random: torch.Generator) -> None:
+    def _grow_and_prune(
+        self, model: Model, sizes_count: bool, recovered: bool, random: torch.Generator
+    ) -> None:
         s = self.settings
         t = {name: tensor.detach() for name, tensor in model.tensors.items()}
         gradient = self.total / self.seen.clamp_min(1)
         room = self._room(model)
         largest = t["scales"].exp().amax(dim=1)
-        gone = t["opacity"].sigmoid() < s.opacity_floor
+        gone = (t["opacity"].sigmoid() < s.opacity_floor) & recovered
         if sizes_count:
             gone |= largest > s.prune_scale * room
         wanted = (gradient > s.grow_gradient) & ~gone

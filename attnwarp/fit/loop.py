@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import statistics
 import time
 import warnings
 from collections.abc import Callable
@@ -45,6 +46,9 @@ NAMED = {"start": "first splats", "held_out": "held-out views"}
 LEAST_SEEN = 1 / 255
 """Least contribution of a splat to all pictures together: one grey level of one pixel."""
 
+LEAST_CHOOSING = 3
+"""Least number of views that choose, so that the median of their PSNR outvotes one outlier."""
+
 SMOOTHING = 0.98
 """Weight of past values in the smoothed loss and PSNR shown during a fit."""
 
@@ -62,7 +66,7 @@ class Record:
         psnr: mean over the held-out views that choose nothing, dB; None without such views.
             Infinite if all equal their pictures.
         psnr_pooled: PSNR of those views' mean squared error.
-        choosing: mean PSNR of the held-out views that choose the splats, dB; None without them.
+        choosing: median PSNR of the held-out views that choose the splats, dB; None without them.
         measures: figures of the caller's measure.
 
     Example:
@@ -151,9 +155,9 @@ def fit(
     fit. A fit planned with another number of iterations continues to the new end, and the report
     says that its past iterations followed another schedule.
 
-    With ``settings.patience`` and at least two held-out views, every second one of them chooses:
-    the splats of the evaluation that shows these best are returned. The reported PSNR is that of
-    the others (:func:`choosing`).
+    With ``settings.patience`` and at least four held-out views, some of them choose
+    (:func:`choosing`): of the evaluations after the last refinement, the splats of the one that
+    shows these best are returned. The reported PSNR is that of the others.
 
     Args:
         start: first splats, of the settings' kind: from :func:`attnwarp.fit.from_points`, or from
@@ -420,7 +424,7 @@ class _Run:
             self.cpu_seconds,
             stopped,
             self.extent,
-            max(self.history, key=_chosen) if self.chooses else self.history[-1],
+            max(self.history, key=self.chosen) if self.best else self.history[-1],
             [] if changes is None else list(changes.cpu().numpy()),
             self.pairs,
         )
@@ -461,11 +465,21 @@ class _Run:
     def _out_of_patience(self) -> bool:
         patience, every = self.settings.patience, self.settings.evaluate_every
         # A stopped process evaluated once more, which must not shorten the patience.
-        regular = (record for record in self.history if record.iteration % every == 0)
-        values = [record.choosing for record in regular if record.choosing is not None]
+        values = [
+            self.chosen(record)
+            for record in self.history
+            if record.iteration % every == 0 and self.chosen(record) > -math.inf
+        ]
         if patience is None or len(values) <= patience:
             return False
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
+
+    def chosen(self, record: Record) -> float:
+        """Likeness to the views that choose; none before the last refinement, since splats that
+        nothing was added to can be nearer to a wrong picture than the finished ones.
+        """
+        early = self.settings.densify and record.iteration < self.density.last
+        return -math.inf if early or record.choosing is None else record.choosing
 
     def figures(self) -> str:
         """Format a line with the smoothed loss and PSNR of the fitted pictures."""
@@ -526,8 +540,9 @@ class _Run:
     @property
     def sh_degree(self) -> int:
         """Degree of the harmonics in use, which grows during the fit."""
-        more = self.iteration // self.settings.sh_every
-        return min(self.settings.sh_degree, self.first_degree + more)
+        s = self.settings
+        more = self.iteration // max(1, round(s.sh_every * s.iterations))
+        return min(s.sh_degree, self.first_degree + more)
 
     def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
         return render(
@@ -576,37 +591,42 @@ class _Run:
             loss=None if math.isnan(self.loss) else self.loss,
             psnr=_mean_psnr(errors),
             psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if errors else None,
-            choosing=_mean_psnr(choosing),
+            choosing=_median_psnr(choosing),
             measures=dict(self.measure(gaussians)) if self.measure else {},
         )
-        if choosing and _chosen(record) > max(map(_chosen, self.history), default=-math.inf):
+        if self.chosen(record) > max(map(self.chosen, self.history), default=-math.inf):
             self.best = self._snapshot()
         self.history.append(record)
 
 
-def choosing(held_out: int, settings: FitSettings) -> range:
+def choosing(held_out: int, settings: FitSettings) -> list[int]:
     """Choose the held-out views that decide which splats are kept, by their numbers: every second
-    one. What is chosen on is never what is reported on, so none of a single view.
+    one, but at least three. What is chosen on is never what is reported on, so none of three views.
 
     Example:
         >>> from attnwarp.fit import FitSettings
         >>> from attnwarp.fit.loop import choosing
-        >>> list(choosing(5, FitSettings(patience=4))), list(choosing(5, FitSettings()))
-        ([1, 3], [])
+        >>> [choosing(count, FitSettings(patience=4)) for count in (3, 4, 7)]
+        [[], [1, 2, 3], [1, 3, 5]]
+        >>> choosing(7, FitSettings())
+        []
     """
-    return range(1, held_out if settings.patience else 0, 2)
+    if not settings.patience or held_out <= LEAST_CHOOSING:
+        return []
+    reported = range(0, held_out, 2)[: held_out - LEAST_CHOOSING]
+    return [view for view in range(held_out) if view not in reported]
 
 
 def _smoothed(before: float, value: float) -> float:
     return value if math.isnan(before) else SMOOTHING * before + (1 - SMOOTHING) * value
 
 
-def _chosen(record: Record) -> float:
-    return -math.inf if record.choosing is None else record.choosing
-
-
 def _mean_psnr(errors: list[float]) -> float | None:
     return sum(map(losses.psnr_of_mse, errors)) / len(errors) if errors else None
+
+
+def _median_psnr(errors: list[float]) -> float | None:
+    return statistics.median(map(losses.psnr_of_mse, errors)) if errors else None
 
 
 def _decibels(value: float) -> str:

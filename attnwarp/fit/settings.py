@@ -7,26 +7,28 @@ from typing import Annotated, Literal
 
 from attnwarp.gaussians import Kind
 from attnwarp.losses import Distortion
-from attnwarp.settings import Count, Number, Range, Settings, Share, Weight
+from attnwarp.settings import Count, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
 Sky = Literal[True, False, "x", "-x", "y", "-y", "z", "-z"]
+Interval = Annotated[float, Range(1e-9, 1)]
 
 
 @dataclass(frozen=True)
 class FitSettings(Settings):
     """Settings of a fit. Equal settings, views, first splats and threads give equal bits.
 
-    Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take
-    30,000 iterations on a GPU. Published iteration counts that must scale with a shorter fit are
-    given as shares of ``iterations`` here.
+    Learning rates and thresholds are those published for 3DGS and 2DGS, whose fits take 30,000
+    iterations on a GPU. Fields named ``_from``, ``_until`` and ``_every`` are shares of
+    ``iterations``, so that a shorter fit passes through all phases; only ``evaluate_every`` counts
+    iterations.
 
     Args:
         kind: "2d" (2DGS) or "3d" (3DGS).
         iterations: number of optimisation steps, one view each.
         seed: seed of the order of views, the random background and the splitting of splats.
         sh_degree: degree of the colour's spherical harmonics, 0 to 3.
-        sh_every: number of iterations between increases of the used degree, which starts at the
+        sh_every: share of the iterations between increases of the used degree, which starts at the
             first splats' degree (0 for points).
         lr_means, lr_means_final: learning rates of the centres at the beginning and the end,
             exponential in between, times the scene's extent.
@@ -44,8 +46,10 @@ class FitSettings(Settings):
             "white" or "random". Random draws a new colour each iteration, so that no colour can
             imitate transparency. "auto" is random for images with transparency, else black.
         densify: True clones, splits and prunes splats.
-        densify_from: first iteration at which splats are added.
-        densify_every: number of iterations between two refinements.
+        densify_from: share of the iterations after which splats are added.
+        densify_every: share of the iterations between two refinements.
+        densify_least: least number of iterations between two refinements, each of which shows one
+            view: a splat's mean gradient rests on no fewer.
         densify_until: share of the iterations after which splats are neither added nor removed.
         grow_gradient: mean norm of the loss's gradient in a splat's screen position above which
             the splat is cloned or split, for a screen 2 wide and high.
@@ -55,8 +59,10 @@ class FitSettings(Settings):
             (published).
         prune_scale: share of the extent above which splats are removed, from the first opacity
             reset or the middle of ``densify_until`` on, whichever is earlier.
-        reset_every: number of iterations between resets of all opacities to ``reset_opacity``,
+        reset_every: share of the iterations between resets of all opacities to ``reset_opacity``,
             while splats are added.
+        reset_least: least number of iterations between resets, which cost so many to recover from:
+            a fit below twice as many has none.
         reset_opacity: opacity after a reset, in (0, 1).
         antialiased: True fits "3d" splats for the opacity-compensated rasteriser.
         near: near-plane depth, as a share of the extent.
@@ -87,7 +93,7 @@ class FitSettings(Settings):
     iterations: Count = 7000
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     sh_degree: Annotated[int, Range(0, 3)] = 3
-    sh_every: Count = 1000
+    sh_every: Interval = 0.14
     lr_means: Weight = 1.6e-4
     lr_means_final: Weight = 1.6e-6
     lr_dc: Weight = 2.5e-3
@@ -103,14 +109,16 @@ class FitSettings(Settings):
     distortion_from: Share = 0.1
     background: Background = "auto"
     densify: bool = True
-    densify_from: Number = 500
-    densify_every: Count = 100
+    densify_from: Share = 0.07
+    densify_every: Interval = 0.05
+    densify_least: Count = 15
     densify_until: Share = 0.5
     grow_gradient: Weight = 2e-4
     max_splats: Count | None = None
     prune_opacity: Share | None = None
     prune_scale: Annotated[float, Range(1e-6)] = 0.1
-    reset_every: Count = 3000
+    reset_every: Interval = 0.1
+    reset_least: Count = 3000
     reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # keeps the logit finite
     antialiased: bool = False
     near: Annotated[float, Range(1e-9)] = 0.01

@@ -327,7 +327,7 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
         return [json.loads(line)["psnr"] for line in lines]
 
     once = ("--threads", 1, "--iterations", 30)
-    flat = ("--kind", "2dgs", "--set", "sh_degree=1", "--set", "sh_every=10")
+    flat = ("--kind", "2dgs", "--set", "sh_degree=1", "--set", "sh_every=0.33")
     assert in_process("fit", data, *once, *flat, "--out", tmp_path / "a").exit_code == 0
     splats = tmp_path / "a" / "splats.ply"
     done = in_process("fit", data, *once, "--start", splats, "--out", tmp_path / "b")
@@ -361,15 +361,15 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
 
 
 def test_held_out_views_that_become_worse_are_said(data, tmp_path):
-    """All pictures are white but the two that are held out: the fit leaves them behind, and the
+    """All pictures are white but the four that are held out: the fit leaves them behind, and the
     splats are kept of before."""
     shutil.copytree(data, tmp_path / "data")
     for path in (tmp_path / "data" / "images").iterdir():
-        level = 0 if path.name in ("1.png", "2.png") else 255
+        level = 0 if path.stem in "1234" else 255
         cv2.imwrite(str(path), np.full((32, 32, 3), level, np.uint8))
     fit = ["fit", tmp_path / "data", "--out", tmp_path / "out", "--set", "evaluate_every=10"]
     fit += ["--iterations", 30, "--set", "densify=false", "--set", "lr_opacity=0.2"]
-    done = in_process(*fit, "--hold-out", "1,2.png")
+    done = in_process(*fit, "--hold-out", "1,2,3,4.png")
     assert done.exit_code == 0, done.stderr
     assert "learns its pictures by heart; take more of them" in done.stderr
     history = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
@@ -380,7 +380,14 @@ def test_held_out_views_that_become_worse_are_said(data, tmp_path):
     )
     assert f"and {last:.2f} in the end" in done.stderr
     assert f"held-out PSNR {rows[0]['psnr']:.2f} dB" in done.stdout
-    assert done.stdout.count("one that chose the splats") == 1
+    assert done.stdout.count("one that chose the splats") == 3
+    assert "too few to choose by" not in done.stderr
+
+    cv2.imwrite(str(tmp_path / "data" / "images" / "4.png"), np.full((32, 32, 3), 255, np.uint8))
+    fit[3] = tmp_path / "few"
+    done = in_process(*fit, "--hold-out", "1,2,3.png")
+    assert "held-out views: 3, too few to choose by" in done.stderr
+    assert "one that chose" not in done.stdout and "by heart" not in done.stderr
 
 
 def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):

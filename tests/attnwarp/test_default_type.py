@@ -95,8 +95,8 @@ def fit_of(kind):
     model, views = splats(), cameras()
     seen = Views(views, pictures(model, views))
     settings = FitSettings(
-        kind=kind, iterations=12, sh_degree=1, background="random", densify_from=3, densify_every=4,
-        densify_until=1, grow_gradient=1e-6, evaluate_every=6,
+        kind=kind, iterations=12, sh_degree=1, background="random", densify_from=0.25,
+        densify_least=4, densify_until=1, grow_gradient=1e-6, evaluate_every=6,
     )  # fmt: skip
 
     def fitted():

@@ -24,7 +24,9 @@ def splats(count=8, kind="3d", scale=0.05, opacity=0.5):
 
 
 def model_and_density(start, **changes):
-    settings = FitSettings(kind=start.kind, sh_degree=1, densify_from=1, densify_every=1, **changes)
+    """Refined at every iteration of 1,000, or of as many as ``changes`` say."""
+    each = {"densify_from": 0, "densify_every": 0.001, "densify_least": 1, "iterations": 1000}
+    settings = FitSettings(kind=start.kind, sh_degree=1, **{**each, **changes})
     model = Model(start, settings, EXTENT)
     return model, Density(settings, EXTENT, np.zeros(3), len(start))
 
@@ -72,7 +74,7 @@ def test_small_splats_are_cloned_and_large_ones_split():
     start = splats(4)
     start.scales[1] = 0.5  # small is up to 0.01 of an extent of 2
     start.scales[0] = 0.01
-    model, density = model_and_density(start, reset_every=1000, prune_scale=1.0)
+    model, density = model_and_density(start, prune_scale=1.0)
     wanting(density, [0, 1])
     assert density.refine(model, 5, torch.Generator().manual_seed(0))
     g = model.gaussians().detach()
@@ -115,14 +117,37 @@ def test_transparent_and_huge_splats_are_removed_but_far_ones_may_be_large():
     start.scales[1] = 0.3  # above 0.1 of the extent
     start.scales[2] = 0.3
     start.means[2] = torch.tensor([0.0, 0, 30.0])  # but not above 0.1 of its distance
-    model, density = model_and_density(start, reset_every=4)
-    density.refine(model, 5, torch.Generator().manual_seed(0))
+    model, density = model_and_density(start, reset_every=0.2, reset_least=1)
+    density.refine(model, 305, torch.Generator().manual_seed(0))
     torch.testing.assert_close(model.gaussians().means.detach(), start.means[[2, 3]])
+
+
+def test_an_opacity_that_a_reset_lowered_is_no_reason_to_go_before_it_could_recover():
+    start = splats(3, "2d")
+    model, density = model_and_density(start, reset_every=0.2, reset_least=1)
+    density.refine(model, 200, torch.Generator().manual_seed(0))  # to 0.01, below the floor of 0.05
+    density.refine(model, 299, torch.Generator().manual_seed(0))
+    assert len(model) == 3
+    with pytest.raises(RuntimeError, match="every one of the 3 splats fell below prune_opacity"):
+        density.refine(model, 300, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("iterations", "first", "between"), [(300, 30, 15), (1000, 100, 50), (30_000, 3000, 1500)]
+)
+def test_a_fit_of_any_length_refines_from_its_share_on_at_its_share(iterations, first, between):
+    # 7 % and 5 % of the iterations, by hand; never more often than each 15 iterations.
+    start = splats(2)
+    settings = FitSettings(kind="3d", sh_degree=1, iterations=iterations)
+    model, density = Model(start, settings, EXTENT), Density(settings, EXTENT, np.zeros(3), 2)
+    random = torch.Generator().manual_seed(0)
+    refined = [k for k in range(first + between + 1) if density.refine(model, k, random)]
+    assert refined == [first, first + between]
 
 
 def test_before_the_first_reset_size_is_no_reason_to_go():
     start = splats(3, scale=0.5)
-    model, density = model_and_density(start, reset_every=1000)
+    model, density = model_and_density(start)
     density.refine(model, 5, torch.Generator().manual_seed(0))
     assert len(model) == 3
 
@@ -130,7 +155,7 @@ def test_before_the_first_reset_size_is_no_reason_to_go():
 def test_a_fit_that_is_too_short_for_a_reset_removes_huge_splats_too():
     start = splats(3, scale=0.05)
     start.scales[1] = 0.3
-    model, density = model_and_density(start, reset_every=1000, iterations=16, densify_until=0.5)
+    model, density = model_and_density(start, iterations=16, densify_until=0.5)
     density.refine(model, 4, torch.Generator().manual_seed(0))
     assert len(model) == 3
     density.refine(model, 5, torch.Generator().manual_seed(0))
@@ -175,7 +200,7 @@ def test_those_that_stay_keep_adams_memory_and_new_ones_have_none():
 def test_a_reset_lowers_every_opacity_and_forgets_where_it_was_going():
     start = splats(3)
     start.opacities[:] = torch.tensor([0.9, 0.2, 0.006])
-    model, density = model_and_density(start, reset_every=5)
+    model, density = model_and_density(start, reset_every=0.005, reset_least=1)
     step(model)
     was = model.gaussians().opacities.detach().clone()
     density.refine(model, 5, torch.Generator())

@@ -26,12 +26,14 @@ from .conftest import blobs, pictures, ring
 
 BUSY = {
     "iterations": 60,
-    "densify_from": 10,
-    "densify_every": 10,
+    "densify_from": 1 / 6,
+    "densify_every": 1 / 6,
+    "densify_least": 10,
     "densify_until": 0.9,
-    "reset_every": 30,
+    "reset_every": 0.5,
+    "reset_least": 1,
     "sh_degree": 1,
-    "sh_every": 20,
+    "sh_every": 1 / 3,
     "normal_from": 0.2,
     "evaluate_every": 20,
     "grow_gradient": 1e-5,
@@ -50,6 +52,13 @@ FAST = {
     "lr_scales": 2e-2,
 }
 """40 splats can be pushed harder than thousands."""
+
+
+def with_four_held_out(scene):
+    """The scene with as many held-out views as choosing needs."""
+    (a, b), cameras, images = scene[1].images, scene[0].cameras, scene[0].images
+    held_out = Views([*scene[1].cameras, *cameras[:2]], [a, b, *images[:2]])
+    return Views(cameras[2:], images[2:]), held_out, *scene[2:]
 
 
 def begin(scene, **changes):
@@ -109,7 +118,7 @@ def test_the_gpu_backend_fits_as_well_as_the_cpus(kind):
 
     psnr, before, _ = reached("gpu")
     assert psnr == pytest.approx(reached("cpu")[0], abs=0.3) and psnr > before + 3
-    growing = {"densify": True, "densify_from": 50, "densify_every": 50, "grow_gradient": 1e-5}
+    growing = {"densify": True, "densify_from": 0.2, "densify_every": 0.2, "grow_gradient": 1e-5}
     psnr, _, count = reached("gpu", **growing, max_splats=60)
     assert psnr == pytest.approx(reached("cpu", **growing, max_splats=60)[0], abs=1)
     assert count == 60
@@ -145,14 +154,15 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
     monkeypatch.setattr("attnwarp.fit.loop.render", watched)
     k = 3
     start, settings = begin(
-        scene, iterations=4 * k, sh_every=k, evaluate_every=1000, **{**FAST, "sh_degree": 2}
+        scene, iterations=4 * k, sh_every=1 / 4, evaluate_every=1000, **{**FAST, "sh_degree": 2}
     )
     result = fit(start, scene[0], settings)
     # Iteration i is drawn with degree i // k, up to the settings' own: 0 at 0, 1 from k, 2 from 2k,
     # and 2 it stays.
     assert asked == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
     # What was not drawn had no gradient and stays as it began; what was drawn moved.
-    only_first = fit(start, scene[0], dataclasses.replace(settings, iterations=k)).gaussians.sh
+    few = dataclasses.replace(settings, iterations=k, sh_every=1)
+    only_first = fit(start, scene[0], few).gaussians.sh
     assert bool((only_first[:, 1:] == 0).all()) and not torch.equal(
         only_first[:, :1], start.sh[:, :1]
     )
@@ -167,6 +177,15 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
         asked.clear()
         fit(dataclasses.replace(result.gaussians, sh=sh), scene[0], settings)
         assert asked == degrees
+
+
+@pytest.mark.parametrize("iterations", [400, 1000])
+def test_a_short_fit_adds_splats_and_uses_all_harmonics(scene, iterations):
+    cameras = ring(8, size=16)
+    start, settings = begin(scene, iterations=iterations, sh_degree=2, ssim=0, distortion=0)
+    result = fit(start, pictures(blobs(), cameras), settings)
+    assert len(result.gaussians) > len(start)
+    assert bool((result.gaussians.sh[:, 4:] != 0).any())
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
@@ -189,7 +208,7 @@ def test_torchs_threads_change_no_bit_of_the_splats():
     start = from_points(points, kind="2d", sh_degree=2)
     cameras = ring(3, size=112)
     views = pictures(blobs(), cameras)
-    settings = FitSettings(iterations=3, sh_degree=2, sh_every=1, densify=False, normal_from=0)
+    settings = FitSettings(iterations=3, sh_degree=2, sh_every=1 / 3, densify=False, normal_from=0)
     results, before = [], torch.get_num_threads()
     for count in (1, 3):
         torch.set_num_threads(count)
@@ -381,6 +400,7 @@ def test_scales_without_a_learning_rate_stay_however_large_or_small(scene):
 
 
 def test_patience_ends_a_fit_that_no_longer_gains(scene):
+    scene = with_four_held_out(scene)
     start, settings = begin(
         scene,
         iterations=500,
@@ -395,6 +415,7 @@ def test_patience_ends_a_fit_that_no_longer_gains(scene):
 
 
 def test_a_sitting_that_ends_between_evaluations_does_not_cost_patience(scene, tmp_path):
+    scene = with_four_held_out(scene)
     start, settings = begin(
         scene, iterations=60, evaluate_every=20, patience=1, min_gain=0.05, **FAST
     )
@@ -596,8 +617,9 @@ def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
         kind="2d",
         sh_degree=0,
         iterations=60,
-        densify_from=10,
-        densify_every=10,
+        densify_from=1 / 6,
+        densify_every=1 / 6,
+        densify_least=10,
         densify_until=1.0,
         prune_opacity=0.5,
     )

@@ -14,6 +14,9 @@ from attnwarp.io import read_ply
 from attnwarp.render import render
 from attnwarp.reporting import Reporter
 
+from .conftest import blobs, ring
+from .conftest import pictures as shown_by
+
 FAST = {
     "sh_degree": 0, "densify": False, "lr_means": 1e-3, "lr_dc": 2e-2, "lr_opacity": 0.2,
     "lr_scales": 2e-2, "kind": "3d",
@@ -62,17 +65,46 @@ def test_exposure_takes_what_is_a_pictures_own(scene):
 
 
 def test_views_that_choose_are_not_those_that_are_reported(scene):
-    """The choosing view is black: the first splats, which show least, are the nearest to it."""
-    cameras = scene[1].cameras
-    held_out = Views(cameras, [scene[1].images[0], np.zeros_like(scene[1].images[1])])
+    """The choosing views are black: the first splats, which show least, are the nearest to them."""
+    cameras = [scene[1].cameras[0], *scene[0].cameras[:3]]
+    held_out = Views(cameras, [scene[1].images[0], *[np.zeros_like(scene[1].images[1])] * 3])
+    shown = Views(scene[0].cameras[3:], scene[0].images[3:])
     settings = FitSettings(iterations=60, evaluate_every=20, patience=5, **FAST)
     start = begin(scene)
-    result = fit(start, scene[0], settings, held_out=held_out)
+    result = fit(start, shown, settings, held_out=held_out)
     assert (result.kept.iteration, result.iteration) == (0, 60)
     torch.testing.assert_close(result.gaussians.sh, start.sh)
     seen = render(start, cameras[0], sh_degree=0, near=0.01 * result.extent).color.clamp(0, 1)
     picture = torch.from_numpy(np.asarray(held_out.images[0], np.float32))
     assert result.kept.psnr == pytest.approx(float(losses.psnr(seen, picture)), abs=1e-3)
+    # One view fewer leaves too few to choose by.
+    few = Views(held_out.cameras[:3], held_out.images[:3])
+    result = fit(start, shown, settings, held_out=few)
+    assert (result.kept.iteration, result.kept.choosing) == (60, None)
+
+
+@pytest.mark.parametrize("outlier", [0.0, None])
+def test_an_outlier_among_the_views_that_choose_leaves_a_fit_of_60_views_its_splats(outlier):
+    """One choosing picture is black, or noise: the mean of PSNR falls as the fit goes on."""
+    truth, cameras = blobs(), ring(60, size=24)
+    images = list(shown_by(truth, cameras).images)
+    noise = np.random.default_rng(0).random(images[8].shape, np.float32)
+    images[8] = noise if outlier is None else np.full_like(images[8], outlier)
+    parts = [
+        Views([c for k, c in enumerate(cameras) if bool(k % 8) == fitted],
+              [i for k, i in enumerate(images) if bool(k % 8) == fitted])
+        for fitted in (True, False)
+    ]  # fmt: skip
+    points = truth.world_means()[::2]
+    start = from_points(points, kind="3d", sh_degree=0)
+    settings = FitSettings(
+        iterations=300, evaluate_every=30, patience=2, grow_gradient=1e-5, max_splats=60,
+        **{**FAST, "densify": True},
+    )  # fmt: skip
+    result = fit(start, parts[0], settings, held_out=parts[1])
+    assert result.kept.iteration >= 150 and len(result.gaussians) > len(start)
+    first, *_, last = result.history
+    assert last.psnr > first.psnr + 3 and result.kept.psnr > last.psnr - 0.5
 
 
 def test_splats_that_no_picture_shows_are_removed(scene):
