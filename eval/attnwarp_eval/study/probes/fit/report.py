@@ -123,7 +123,7 @@ class FitReport(ProbeReport):
             number(_mean([view.metrics["fit.ssim"] for view in record.views])),
             number(_measure(last, "depth.abs_rel")),
             number(_measure(last, "depth.normal_median")),
-            str(last.splats),
+            f"{points[0].splats} to {last.splats}",
             str(last.iteration),
             number(last.cpu_seconds),
             number(last.seconds),
