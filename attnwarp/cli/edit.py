@@ -248,7 +248,10 @@ def edit(
             "scene": scene, "editor": editor, "kind": kind,
             **{name: value for name, value in vars(editing).items() if name in DECIDING},
         }  # fmt: skip
-        asked = {k: v if v is None else str(v) for k, v in typed.items()}
+        asked = {
+            k: " ".join(v) or None if isinstance(v, (list, tuple)) else v if v is None else str(v)
+            for k, v in typed.items()
+        }
         check_asked(method, instruction, settings, budget, out, edit_options, asked)
         origin = ""
         if scene:

@@ -225,7 +225,23 @@ class Marking:
             "VIEW",
         ),
     ] = None
-    at: AtOption = None
+    at: Annotated[
+        list[str] | None,
+        option(
+            "Edit only the thing at this point: px of the picture's file, from its top left corner;"
+            " given again, it adds the thing, or the part, at another point.",
+            "X,Y",
+        ),
+    ] = None
+    away: Annotated[
+        list[str] | None,
+        option(
+            "Take what is at this point away from what --at marks, in the same px; may be given"
+            " again.",
+            "X,Y",
+            "--not",
+        ),
+    ] = None
     box: BoxOption = None
     words: WhereOption = None
     mask: Annotated[
@@ -244,11 +260,12 @@ class Marking:
     def marks(self) -> Marks:
         """Build the marks."""
         check_segmenter(self.segmenter, self.words)
-        from attnwarp.command.marks import Marks, numbers
+        from attnwarp.command.marks import Marks, numbers, points
 
         return Marks(
             self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
-            numbers(self.at, "X,Y", "--at"), self.words, self.segmenter or SEGMENTER,
+            points(self.at, "--at"), self.words, self.segmenter or SEGMENTER,
+            points(self.away, "--not"),
         )  # fmt: skip
 
 

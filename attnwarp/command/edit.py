@@ -20,6 +20,7 @@ from attnwarp.command.marks import (
     Marks,
     check_middle,
     lifted_segments,
+    pairs,
     read_mask,
     read_over_black,
     say_unmarked,
@@ -61,7 +62,7 @@ from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
-from attnwarp.warp import piece_around
+from attnwarp.warp import nearer, piece_around
 from attnwarp.workdir import FORMAT, Budget
 
 FIT_FOLDER = "fit"
@@ -269,11 +270,12 @@ def marked(
         return lambda splats: None
     camera, full = views.cameras[index], pictured.cameras[index]
     size = full.width, full.height
-    check_marks(*size, box=marks.box, at=marks.at)
+    check_marks(*size, box=marks.box, at=marks.at, away=marks.away)
 
-    def of_source(piece: Mask | None = None) -> Mask:
+    def of_source(pieces: Sequence[Mask] = (), left: Mask | None = None) -> Mask:
+        picture = views.picture(index)
         mask = source_mask(
-            marks, camera, views.picture(index), pictures[index], size, out, device, report, piece
+            marks, camera, picture, pictures[index], size, out, device, report, pieces, left
         )
         kept = views.masks[index]
         if kept is not None and not (mask & kept).any():
@@ -293,8 +295,14 @@ def marked(
     def segments(splats: Gaussians) -> list[Segment]:
         # Shrunk sides are rounded, so a click on the border could leave the picture.
         sides = camera.width, camera.height
-        at = [min(sides[0] / size[0] * v, s) for v, s in zip(marks.at or (), sides, strict=False)]
-        mask = of_source(piece_around(splats, camera, at)) if early is None else early
+        at, away = (
+            [[min(side / full * v, side) for v, side, full in zip(point, sides, size, strict=True)]
+             for point in pairs(pixels)]
+            for pixels in (marks.at, marks.away)
+        )  # fmt: skip
+        pieces = [piece_around(splats, camera, point) for point in at]
+        left = nearer(splats, camera, at, away) if away else None
+        mask = of_source(pieces, left) if early is None else early
         lifted = lifted_segments(mask, splats, views, index, report)
         if not any((segment > 0.5).any() for segment in lifted):
             raise InputError(

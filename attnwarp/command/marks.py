@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +55,12 @@ class Marks:
 
     Args:
         box: x0, y0, x1, y1 around the object, in px of the source's picture.
-        at: x, y of a point on the object, in px of the source's picture.
+        at: x, y of each point on the object, in px of the source's picture.
+        away: x, y of each point that is none of it, likewise; only with ``at``.
         segmenter: finder of the words, see :func:`attnwarp.editing.segment.load_segmenter`.
 
     Raises:
-        InputError: several marks are given, or the words have no letter.
+        InputError: several marks are given, or the words have no letter, or ``away`` is alone.
 
     Example:
         >>> from attnwarp.command.marks import Marks
@@ -72,9 +74,12 @@ class Marks:
     at: tuple[float, ...] | None = None
     words: str | None = None
     segmenter: str = "clip-parts"
+    away: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         given = self._given
+        if self.away and not self.at:
+            raise InputError("--not: takes away from what --at marks; give --at X,Y too")
         if len(given) > 1:
             raise InputError(f"{given[1]}: got {given[0]} too, expected one of the two")
         if self.words is not None and not self.words.strip():
@@ -94,14 +99,25 @@ class Marks:
         return "".join(self._given)
 
     @property
-    def pixels(self) -> tuple[float, ...]:
-        """Coordinates of a box or a point, in px; empty for another mark."""
-        return self.box or self.at or ()
-
-    @property
     def of_source(self) -> bool:
         """True if only the source view is marked, so that its mask must be lifted."""
         return self.option not in ("", "--masks")
+
+
+def points(texts: Sequence[str] | None, option: str) -> tuple[float, ...] | None:
+    """Parse the points of an option that may be repeated: x, y of each, or None without any.
+
+    Example:
+        >>> from attnwarp.command.marks import points
+        >>> points(["64,68", "3,4"], "--at")
+        (64.0, 68.0, 3.0, 4.0)
+    """
+    return tuple(v for text in texts or () for v in numbers(text, "X,Y", option) or ()) or None
+
+
+def pairs(pixels: Sequence[float] | None) -> list[Sequence[float]]:
+    """Group coordinates by point."""
+    return [(pixels or ())[k : k + 2] for k in range(0, len(pixels or ()), 2)]
 
 
 def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
@@ -157,14 +173,16 @@ def source_mask(
     out: Path,
     device: str,
     report: Reporter,
-    piece: Mask | None = None,
+    pieces: Sequence[Mask] = (),
+    nearer: Mask | None = None,
 ) -> Mask:
     """Compute the mask of the marked source view, (H, W) bool.
 
     Args:
         size: width and height, in px, of the file that coordinates refer to.
-        piece: (H, W) bool surface around a point, :func:`attnwarp.warp.piece_around`; all True if
-            unknown, and colours alone decide.
+        pieces: (H, W) bool surface around each point of ``marks.at``,
+            :func:`attnwarp.warp.piece_around`; all True if unknown, and colours alone decide.
+        nearer: (H, W) bool what ``marks.away`` leaves, :func:`attnwarp.warp.nearer`.
     """
     if marks.mask is not None:
         mask = read_mask(marks.mask, camera, beside=picture, option="--mask")
@@ -172,8 +190,15 @@ def source_mask(
             raise InputError(f"--mask: {marks.mask} is black; white is edited")
     elif marks.words is not None:
         mask = mask_by_words(marks, camera, image, out, device)
-    elif piece is not None and not piece.all():
-        mask = snap(to_float(image), piece)
+    elif marks.at is not None:
+        mask = np.logical_or.reduce([
+            picture_mask(replace(marks, at=tuple(at)), image, size)
+            if piece.all()
+            else snap(to_float(image), piece)
+            for at, piece in zip(pairs(marks.at), pieces, strict=True)
+        ])  # fmt: skip
+        if nearer is not None:
+            mask &= nearer
     else:
         mask = picture_mask(marks, image, size)
     write_marked(marks, image, mask, size, out)
@@ -181,6 +206,9 @@ def source_mask(
     report.log(f"{what} marks {mask.mean():.1%} of the source view {camera.name}: {out / MARKED}")
     if marks.at is not None:
         warn_of_much(mask, f": look at {out / MARKED}")
+        report.log(
+            "if a part is missing, give --at X,Y again, on it; if too much is lit, --not X,Y"
+        )
     return mask
 
 
@@ -190,8 +218,9 @@ def warn_of_much(mask: Mask, more: str = "") -> None:
     if edges >= 2 or mask.mean() >= HARDLY:
         reached = f"reaches {edges} edges" if edges >= 2 else "covers half"
         warnings.warn(
-            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; --box"
-            " X0,Y0,X1,Y1 of `attnwarp edit` marks the thing by a box",
+            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; in"
+            " `attnwarp edit`, --not X,Y on what is too much takes it away, and --box X0,Y0,X1,Y1"
+            " marks the thing by a box",
             InputWarning,
             stacklevel=3,
         )
@@ -199,7 +228,10 @@ def warn_of_much(mask: Mask, more: str = "") -> None:
 
 def typed(marks: Marks, size: tuple[int, int]) -> str:
     """Write a box's or a point's coordinates with the size that they refer to, else nothing."""
-    numbers = ",".join(f"{v:g}" for v in marks.pixels)
+    numbers = ",".join(f"{v:g}" for v in marks.box or ())
+    if marks.at:
+        at, away = ([f"{x:g},{y:g}" for x, y in pairs(p)] for p in (marks.at, marks.away))
+        numbers = " ".join([*at, *(f"--not {one}" for one in away)])
     return f"{numbers} of {size[0]} x {size[1]} px" if numbers else ""
 
 
@@ -216,12 +248,18 @@ def write_marked(
 
     picture = np.ascontiguousarray(to_bytes(to_float(image) * np.where(mask, 1, 0.3)[..., None]))
     h, w = mask.shape
-    at = [round(v * s) for v, s in zip(marks.pixels, [w / size[0], h / size[1]] * 2, strict=False)]
+
+    def drawn(pixels: tuple[float, ...]) -> list[list[int]]:
+        return [[round(x * w / size[0]), round(y * h / size[1])] for x, y in pairs(pixels)]
+
     for color, width in (((0, 0, 0), 3), ((255, 255, 0), 1)):
         if marks.box is not None:
-            cv2.rectangle(picture, at[:2], at[2:], color, width)
-        elif marks.at is not None:
+            low, high = drawn(marks.box)
+            cv2.rectangle(picture, low, high, color, width)
+        for at in drawn(marks.at or ()):
             cv2.drawMarker(picture, at, color, cv2.MARKER_CROSS, 9, width)
+        for at in drawn(marks.away or ()):
+            cv2.drawMarker(picture, at, color, cv2.MARKER_TILTED_CROSS, 9, width)
     out.mkdir(parents=True, exist_ok=True)
     Workdir(out, "an edit").write_picture(MARKED, picture)
 
@@ -291,7 +329,8 @@ def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> Non
         x0, y0, x1, y1 = (scale * v for v in marks.box)
         limit, away = CORE, np.hypot((2 * x - x0 - x1) / (x1 - x0), (2 * y - y0 - y1) / (y1 - y0))
     elif marks.at is not None:
-        limit, away = CLICKED, np.hypot(x - scale * marks.at[0], y - scale * marks.at[1])
+        away = np.min([np.hypot(x - scale * u, y - scale * v) for u, v in pairs(marks.at)], axis=0)
+        limit = CLICKED
     else:
         inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         limit, away = 0.5, 1 - inward / inward.max()

@@ -80,12 +80,13 @@ class Edit(Part):
 
 class MaskPart(Part):
     """Marks of the edited part, one of these: a folder of masks by the views' names; or, for the
-    source view, a mask, a box, a point, or words with the segmenter that finds them."""
+    source view, a mask, a box, x, y of points, or words with the segmenter that finds them."""
 
     folder: str | None = None
     source: str | None = None
     box: tuple[float, float, float, float] | None = None
-    at: tuple[float, float] | None = None
+    at: tuple[float, ...] | None = None
+    away: tuple[float, ...] | None = None
     words: str | None = None
     segmenter: str = "clip-parts"
 
