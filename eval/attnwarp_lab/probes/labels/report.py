@@ -43,7 +43,7 @@ class LabelReport(ProbeReport):
     stage = "pair"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """What becomes of tokens, by variant; errors at depth edges, from the source and from view
+        """Fate of tokens, by variant; errors at depth edges, from the source and from view
         to view.
         """
         names = dict.fromkeys(v for c, _ in results.finished(self.name) for v in c.variants)
