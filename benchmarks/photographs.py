@@ -1,30 +1,41 @@
 """Fits of photographs: largest splat, distortion, held-out PSNR, pixels beyond the scene.
 
     python -m benchmarks.photographs --draw data/sky --seed 1
+    python -m benchmarks.photographs --draw data/yard --seed 1 --above
     python -m benchmarks.photographs --out reports/photographs NAME=FIT=DATA ...
 
-The first writes a drawn scene under clouds, which no first point describes, with its true depth.
-The second measures folders of ``attnwarp fit`` on the data they were fitted to; fits that differ in
-the seed alone have one NAME.
+The first writes a drawn scene under clouds, which no first point describes, with its true depth;
+the second one from above, without points at its edge. The third measures folders of ``attnwarp
+fit`` on the data they were fitted to, with a ``tracks.json`` of ``attnwarp-eval tracks`` there, if
+any; fits that differ in the seed alone have one NAME. Fits ``NAME, before`` and ``NAME`` are
+compared by seed and view.
 """
 
 from __future__ import annotations
 
 import json
 import statistics
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from attnwarp.camera import Camera
+from attnwarp.camera import Camera, up_of
+from attnwarp.fit import FitSettings
+from attnwarp.fit.loop import choosing
 from attnwarp.io import read_dataset, read_image, read_ply
 from attnwarp.io.names import file_stems
 from attnwarp.render import render
 from benchmarks import command
 
-VIEWS, SIZE, POINTS = 40, 192, 4000
+VIEWS, ABOVE, SIZE, POINTS = 40, 17, 192, 4000
+
+NEAR = 0.5
+"""First points of a scene seen from above lie within so many camera distances of its middle:
+structure from motion finds few on lawn and paving around it."""
+
 OPAQUE = 0.5
 """Alpha below which a pixel shows what is beyond the scene."""
 
@@ -39,8 +50,10 @@ def clouds(directions: np.ndarray, seed: int) -> np.ndarray:
     return np.asarray(share * [0.93, 0.94, 0.96] + (1 - share) * [0.35, 0.55, 0.85])
 
 
-def draw(folder: Path, seed: int) -> None:
-    """Write drawn scene ``seed`` under clouds, seen from lower down than its own cameras."""
+def draw(folder: Path, seed: int, file: Path | None, above: bool, size: int) -> None:
+    """Write a scene's photographs and their true depth: under clouds, from lower down than its own
+    cameras, or from above; ``seed`` draws the scene unless a ``file`` describes one.
+    """
     from attnwarp.io import Dataset, write_transforms
     from attnwarp_eval.drawn.files import write
     from attnwarp_eval.drawn.population import population
@@ -49,19 +62,24 @@ def draw(folder: Path, seed: int) -> None:
     from attnwarp_eval.splats.export import first_points, orbit, picture
     from attnwarp_eval.truth import Geometry
 
-    (drawn,) = population({"drawn": 1, "seed": seed}).scenes()
-    scene = load_scene(write(drawn, folder))
+    if file is None:
+        (drawn,) = population({"drawn": 1, "seed": seed}).scenes()
+        file = write(drawn, folder)
+    scene = load_scene(file)
     geometry = Geometry(scene)
     cloud = first_points(scene, POINTS, seed=seed, geometry=geometry)
     radius = scene.spec.cameras.radius
-    near = np.linalg.norm(cloud.points - scene.center, axis=1) < 3 * radius
+    near = np.linalg.norm(cloud.points - scene.center, axis=1) < (NEAR if above else 3) * radius
     cameras, paths, depths = [], [], {}
-    for k, camera in enumerate(orbit(scene, VIEWS, SIZE)):
+    for k, camera in enumerate(orbit(scene, ABOVE if above else VIEWS, size)):
         eye = np.array(camera.position)
-        eye[2] = scene.center[2] + 0.3 * (eye[2] - scene.center[2]) + 0.05 * radius
-        aim = scene.center + np.array([0, 0, 0.2 * radius])
+        aim = scene.center + np.array([0, 0, 0 if above else 0.2 * radius])
+        if above:
+            eye[2] = scene.center[2] + (0.9 + 0.1 * (k % 4)) * radius
+        else:
+            eye[2] = scene.center[2] + 0.3 * (eye[2] - scene.center[2]) + 0.05 * radius
         low = Camera.look_at(
-            eye.tolist(), aim.tolist(), width=SIZE, height=SIZE, fov_y=55, name=f"{k:02d}.png"
+            eye.tolist(), aim.tolist(), width=size, height=size, fov_y=55, name=f"{k:02d}.png"
         )
         image, depth = picture(scene, low, 8), geometry.trace(low).depth
         sky = ~np.isfinite(depth)
@@ -81,9 +99,9 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
     splats, dataset = read_ply(fit / "splats.ply"), read_dataset(data)
     extent, near = settings["extent"], settings["near"] * settings["extent"]
     middle = np.stack([camera.position for camera in dataset.cameras]).mean(0)
-    scene = splats.select(
-        torch.from_numpy(np.linalg.norm(splats.world_means() - middle, axis=1) <= splats.far)
-    )
+    away = torch.from_numpy(splats.world_means() - middle)
+    far = away.norm(dim=1) > splats.far
+    scene, sky = splats.select(~far), replace(splats, far=np.inf).select(far)
     depths = np.load(data / "depth.npz") if (data / "depth.npz").is_file() else {}
     history = [json.loads(line) for line in (fit / "history.jsonl").read_text().splitlines()]
     stems = file_stems(dataset.cameras)
@@ -102,28 +120,52 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
             "distortion": min(float(form.min()) for form in forms),
         }
         if path.name in depths:
-            views[path.stem] |= against(view, depths[path.name])
+            behind = render(sky, camera.resize(width, height), near=near).alpha.numpy()
+            views[path.stem] |= against(view, behind, depths[path.name])
     return {
         "seed": settings["seed"],
         "iterations": history[-1]["iteration"],
         "stopped": settings["stopped"],
         "splats": len(splats),
-        "sky_splats": len(splats) - len(scene),
+        "sky_splats": len(sky),
+        "below_horizon": below(away[far], dataset.cameras),
         "largest": float(scene.scales.max()) / extent,
         "cpu_seconds": history[-1]["cpu_seconds"],
         "chose": chose(settings, [stem for stem in stems if stem in views]),
+        "tracks": tracks(fit / "tracks.json"),
         "views": views,
     }
 
 
+def tracks(path: Path) -> float | None:
+    """Median distance in px of warps from the tracks of structure from motion, if measured."""
+    if not path.is_file():
+        return None
+    (row,) = (row for row in json.loads(path.read_text())["rows"] if row["views"] == "all")
+    return float(row["figures"]["median"]["value"])
+
+
+def below(away: torch.Tensor, cameras: list[Camera]) -> int:
+    """Number of sky splats, by their offsets from the cameras' mean, below the horizon."""
+    return int((away @ torch.from_numpy(up_of(cameras)[0]) < 0).sum())
+
+
 def chose(settings: dict[str, Any], held_out: list[str]) -> list[str]:
-    """Names of the held-out views that chose the splats: every second one, with patience."""
-    known = "sky" in settings and settings["patience"] is not None
-    return held_out[1::2] if known else []
+    """Names of the held-out views that chose the splats: every second one at first, then by
+    :func:`attnwarp.fit.loop.choosing`; either counts.
+    """
+    rule = choosing(len(held_out), FitSettings(patience=settings["patience"]))
+    return [
+        name
+        for k, name in enumerate(held_out)
+        if settings["patience"] is not None and (k % 2 or k in rule)
+    ]
 
 
-def against(view: Any, depth: np.ndarray) -> dict[str, float]:
-    """Errors of a render at a view's true depth, infinite in the sky."""
+def against(view: Any, behind: np.ndarray, depth: np.ndarray) -> dict[str, float]:
+    """Errors of a render at a view's true depth, infinite in the sky; ``behind``: its splats' alpha
+    alone.
+    """
     solid, alpha = np.isfinite(depth), view.alpha.numpy()
     error = np.abs(view.depth.double().numpy()[solid] / depth[solid] - 1)
     shown = alpha[solid] >= OPAQUE
@@ -132,6 +174,7 @@ def against(view: Any, depth: np.ndarray) -> dict[str, float]:
         "depth_wrong": float((error[shown] > 0.1).mean()),
         "surface_lost": float(1 - shown.mean()),
         "sky_with_depth": float((alpha[~solid] >= OPAQUE).mean()) if (~solid).any() else 0.0,
+        "sky_covered": float((behind[~solid] >= OPAQUE).mean()) if (~solid).any() else 1.0,
     }
 
 
@@ -164,7 +207,7 @@ def row(name: str, fits: list[dict[str, Any]], apart: set[str]) -> str:
 
 def depth_row(name: str, fits: list[dict[str, Any]]) -> str:
     """A line of the table of scenes whose depth is known."""
-    figures = ("depth_error", "depth_wrong", "surface_lost", "sky_with_depth")
+    figures = ("depth_error", "depth_wrong", "surface_lost", "sky_with_depth", "sky_covered")
     means = [
         statistics.mean(view[figure] for fit in fits for view in fit["views"].values())
         for figure in figures
@@ -192,13 +235,58 @@ def report(results: dict[str, list[dict[str, Any]]]) -> str:
         lines += [
             "",
             "Against the true depth: the median relative error and the share off by more than 10 %,"
-            " both where alpha is at least 0.5; surface where it is less; sky where it is not.",
+            " both where alpha is at least 0.5; surface where it is less; sky where it is not, and"
+            " where the sky's splats alone are opaque.",
             "",
-            "| fit | median error | off by 10 % | surface without depth | sky with depth |",
-            "|---|---|---|---|---|",
+            "| fit | median error | off by 10 % | surface without depth | sky with depth |"
+            " sky covered |",
+            "|---|---|---|---|---|---|",
             *(depth_row(name, fits) for name, fits in known.items()),
         ]
+    lines += [
+        "",
+        "After less before, paired by seed and held-out view that chooses in neither: mean (least"
+        " and largest seed). Depth error, distance from tracks and CPU: after over before."
+        " Low: below the horizon.",
+        "",
+        "| capture | PSNR, dB | depth error | tracks | CPU | sky splats (of them low), before |"
+        " after |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        compared(name, results[f"{name}, before"], fits)
+        for name, fits in results.items()
+        if f"{name}, before" in results
+    ]
     return "\n".join(lines)
+
+
+def compared(name: str, before: list[dict[str, Any]], after: list[dict[str, Any]]) -> str:
+    """A line of the table of differences between fits of one capture."""
+    gains, errors, costs, strays = [], [], [], []
+    for old, new in zip(before, after, strict=True):
+        assert old["seed"] == new["seed"] and old["iterations"] == new["iterations"]
+        kept = [stem for stem in new["views"] if stem not in {*old["chose"], *new["chose"]}]
+        pairs = [(old["views"][stem], new["views"][stem]) for stem in kept]
+        gains.append(statistics.mean(b["psnr"] - a["psnr"] for a, b in pairs))
+        costs.append(new["cpu_seconds"] / old["cpu_seconds"])
+        if new["tracks"] is not None:
+            strays.append(new["tracks"] / old["tracks"])
+        if "depth_error" in pairs[0][0]:
+            was, now = (
+                sum(view["depth_error"] for view in fit["views"].values()) for fit in (old, new)
+            )
+            errors.append(now / was)
+    cells = [name] + [
+        f"{statistics.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
+        if values
+        else ""
+        for values, form in ((gains, "+.2f"), (errors, ".2f"), (strays, ".2f"), (costs, ".2f"))
+    ]
+    for fits in (before, after):
+        low = sum(fit["below_horizon"] for fit in fits)
+        cells.append(f"{sum(fit['sky_splats'] for fit in fits):,} ({low:,})")
+    return "| " + " | ".join(cells) + " |"
 
 
 def main() -> None:
@@ -206,10 +294,13 @@ def main() -> None:
     parser = command.parser("photographs", "Draw a scene under clouds, or measure fits.")
     parser.add_argument("--draw", type=Path, help="write a drawn scene under clouds here")
     parser.add_argument("--seed", type=int, default=0, help="seed of the drawn scene")
+    parser.add_argument("--scene", type=Path, help="draw this scene file instead")
+    parser.add_argument("--above", action="store_true", help="draw 17 views from above")
+    parser.add_argument("--size", type=int, default=SIZE, help="side of a drawn picture in px")
     parser.add_argument("fits", nargs="*", metavar="NAME=FIT=DATA", help="folders to measure")
     options = parser.parse_args()
     if options.draw:
-        draw(options.draw, options.seed)
+        draw(options.draw, options.seed, options.scene, options.above, options.size)
         return
     results: dict[str, list[dict[str, Any]]] = {}
     for text in options.fits:
