@@ -3,7 +3,7 @@
     python reports/photographs/click/measure.py CAPTURES FITS
 
 CAPTURES/NAME are pinhole captures, FITS/NAME/splats.ply their splats. Draws the masks, PNG of one
-bit, and writes results.json and the table of click.md.
+bit, and writes results.json and the tables of click.md.
 """
 
 from __future__ import annotations
@@ -59,14 +59,30 @@ def overlaps(name: str, about: dict, captures: Path, fits: Path) -> dict:
     return result
 
 
+def tables(results: dict) -> str:
+    """Write the clicks of photographs, and the mark beside growing over splats (growth.json)."""
+    lines = [
+        "| capture | clicked view | median (least to most) of five pictures |",
+        "|---|---|---|",
+    ]
+    for name, clicks in results.items():
+        for source, each in clicks.items():
+            values = [*each.values()]
+            text = f"{np.median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+            lines.append(f"| {name} | `{source}` | {text} |")
+    lines += ["", "| thing | the mark: overlap, recall, precision | grown |", "|---|---|---|"]
+    for name, ways in json.loads((HERE / "growth.json").read_text())["things"].items():
+        cells = [", ".join(f"{v:.2f}" for v in np.mean(ways[k], 0)) for k in ("mark", "grown")]
+        lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    return "\n".join(lines) + "\n"
+
+
 if __name__ == "__main__":
     drawings = json.loads((HERE / "outlines.json").read_text())
     results = {
         name: overlaps(name, about, *map(Path, sys.argv[1:3])) for name, about in drawings.items()
     }
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    for name, clicks in results.items():
-        for source, each in clicks.items():
-            print(name, source, *each.values(), "median", np.median([*each.values()]))
-    every = [[*each.values()] for clicks in results.values() for each in clicks.values()]
-    print("first clicks", np.median([every[0], every[3]]), "all clicks", np.median(every))
+    page = HERE.parent / "click.md"
+    start, _, end = page.read_text().split("<!-- table -->\n")
+    page.write_text("<!-- table -->\n".join([start, tables(results), end]))
