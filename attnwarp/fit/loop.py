@@ -346,6 +346,10 @@ class _Run:
         planned = settings.get("iterations", now)
         if planned != now:
             settings["iterations"] = now
+            # By the new plan splats may be added again, and what is kept comes after them.
+            state["best"] = {}
+            for record in state.get("history", []):
+                record["choosing"] = None
             report.log(
                 f"a fit planned with {planned} iterations goes on to {now}; learning rates,"
                 " densification and losses were those of the former plan so far, so a fit of"

@@ -547,6 +547,14 @@ def test_a_fit_that_is_lengthened_is_one_of_that_length_where_no_schedule_depend
         fit(start, scene[0], settings.changed(iterations=8), folder=tmp_path / "longer")
 
 
+def test_a_lengthened_fit_keeps_nothing_of_before_its_new_plans_last_refinement(scene, tmp_path):
+    scene = with_four_held_out(scene)
+    start, settings = begin(scene, iterations=20, evaluate_every=10, patience=9, sh_degree=0)
+    sitting(scene, start, settings, tmp_path)
+    result = sitting(scene, start, settings.changed(iterations=60), tmp_path, until=5)
+    assert result.kept.iteration == result.iteration == 25  # of 30 with refinements
+
+
 def test_splats_without_a_checkpoint_stay(scene, tmp_path):
     """A fit whose checkpoint was removed, or splats of another program."""
     start, settings = begin(scene, iterations=2, sh_degree=0)
