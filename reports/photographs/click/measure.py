@@ -74,6 +74,15 @@ def tables(results: dict) -> str:
     for name, ways in json.loads((HERE / "growth.json").read_text())["things"].items():
         cells = [", ".join(f"{v:.2f}" for v in np.mean(ways[k], 0)) for k in ("mark", "grown")]
         lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    lines += [
+        "",
+        "| thing | clicked view | overlap in four others after each click |",
+        "|---|---|---|",
+    ]
+    for name, views in json.loads((HERE / "clicks.json").read_text()).items():
+        for view, steps in views.items():
+            cells = ", ".join(f"`{option}` {value:.2f}" for option, value in steps)
+            lines.append(f"| {name} | `{Path(view).stem}` | {cells} |")
     return "\n".join(lines) + "\n"
 
 
