@@ -75,12 +75,11 @@ def _mirrored(
     return away, on_object, reflected_hits.point[hit], reflected_hits.normal[hit], np.where(hit, np.cumsum(hit) - 1, -1)
 
 
-def _radiance(
-    scene: Scene, surfaces: tuple[Look, ...], geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
-    directions: Array, sky_rays: list[tuple[Array, npt.NDArray[np.bool_]]],
-    mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
+def light_on(
+    scene: Scene, geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
+    sky_rays: list[tuple[Array, npt.NDArray[np.bool_]]],
 ) -> Array:  # fmt: skip
-    color = _albedo(scene, surfaces, geometry, points, ids)
+    """(N, 3) irradiance of points: sun and sky."""
     light = np.zeros((len(points), 3))
     for spec in scene.spec.lights:
         if isinstance(spec, SunSpec):
@@ -91,6 +90,16 @@ def _radiance(
             light[facing] += cosine[facing, None] * spec.irradiance * np.array(linear_rgb(spec.color))
     for direction, reached in sky_rays:
         light += np.where(reached[:, None], _sky(scene, direction), 0) * (np.pi / len(sky_rays))
+    return light
+
+
+def _radiance(
+    scene: Scene, surfaces: tuple[Look, ...], geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
+    directions: Array, sky_rays: list[tuple[Array, npt.NDArray[np.bool_]]],
+    mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
+) -> Array:  # fmt: skip
+    color = _albedo(scene, surfaces, geometry, points, ids)
+    light = light_on(scene, geometry, points, normals, ids, sky_rays)
     radiance = color * light / np.pi
     for k, surface in enumerate(surfaces):
         if FINISHES[surface.finish] == "shiny" or FINISHES[surface.finish] in REFLECTANCE:
