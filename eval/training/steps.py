@@ -77,13 +77,14 @@ def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
 
 def train_steps(
     net: torch.nn.Module, plan: Plan, tasks: Sequence[Task], checkpoint: Path, recipe: Mapping[str, Any],
-    device: torch.device, spent: float = 0.0,
+    device: torch.device, spent: float = 0.0, warm: int = WARM,
 ) -> None:  # fmt: skip
     """Take a stage's steps, or those that are left, with an average of the weights beside them.
 
     Args:
         recipe: inputs that decide the result, see :class:`training.common.Run`.
         spent: seconds that went before the first step.
+        warm: steps until the rate is at its peak.
     """
     recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states
     stepper = Stepper(net, plan.peak, tasks, device)
@@ -97,7 +98,7 @@ def train_steps(
         counts: dict[str, int] = {}
         order = rng.choice(len(tasks), STEPS_AN_EPOCH, p=shares / shares.sum())
         for step, (index, inputs) in enumerate(minibatches(tasks, order.tolist(), generator)):
-            rate = falling_rate(number * STEPS_AN_EPOCH + step, plan.steps, plan.peak)
+            rate = falling_rate(number * STEPS_AN_EPOCH + step, plan.steps, plan.peak, warm)
             for key, value in stepper.step(index, inputs, rate).items():
                 name = f"{key} {index}" if len(tasks) > 1 else key
                 # Read once an epoch: a GPU would wait for each.
