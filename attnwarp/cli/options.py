@@ -237,7 +237,7 @@ class Marking:
         list[str] | None,
         option(
             "Take what is at this point away from what --at marks, in the same px; may be given"
-            " again.",
+            " again. It may take most of the thing, too.",
             "X,Y",
             "--not",
         ),

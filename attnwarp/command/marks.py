@@ -207,7 +207,7 @@ def source_mask(
     if marks.at is not None:
         warn_of_much(mask, f": look at {out / MARKED}")
         report.log(
-            "if a part is missing, give --at X,Y again, on it; if too much is lit, --not X,Y"
+            "if a part is missing, give --at X,Y again, on it; if too much is lit, --box or --mask"
         )
     return mask
 
@@ -218,9 +218,8 @@ def warn_of_much(mask: Mask, more: str = "") -> None:
     if edges >= 2 or mask.mean() >= HARDLY:
         reached = f"reaches {edges} edges" if edges >= 2 else "covers half"
         warnings.warn(
-            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; in"
-            " `attnwarp edit`, --not X,Y on what is too much takes it away, and --box X0,Y0,X1,Y1"
-            " marks the thing by a box",
+            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; --box"
+            " X0,Y0,X1,Y1 of `attnwarp edit` marks the thing by a box",
             InputWarning,
             stacklevel=3,
         )
