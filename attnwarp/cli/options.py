@@ -233,15 +233,6 @@ class Marking:
             "X,Y",
         ),
     ] = None
-    away: Annotated[
-        list[str] | None,
-        option(
-            "Take what is at this point away from what --at marks, in the same px; may be given"
-            " again. It may take most of the thing, too.",
-            "X,Y",
-            "--not",
-        ),
-    ] = None
     box: BoxOption = None
     words: WhereOption = None
     mask: Annotated[
@@ -265,7 +256,6 @@ class Marking:
         return Marks(
             self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
             points(self.at, "--at"), self.words, self.segmenter or SEGMENTER,
-            points(self.away, "--not"),
         )  # fmt: skip
 
 

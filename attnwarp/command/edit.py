@@ -62,7 +62,7 @@ from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
-from attnwarp.warp import nearer, piece_around
+from attnwarp.warp import piece_around
 from attnwarp.workdir import FORMAT, Budget
 
 FIT_FOLDER = "fit"
@@ -270,12 +270,12 @@ def marked(
         return lambda splats: None
     camera, full = views.cameras[index], pictured.cameras[index]
     size = full.width, full.height
-    check_marks(*size, box=marks.box, at=marks.at, away=marks.away)
+    check_marks(*size, box=marks.box, at=marks.at)
 
-    def of_source(pieces: Sequence[Mask] = (), left: Mask | None = None) -> Mask:
+    def of_source(pieces: Sequence[Mask] = ()) -> Mask:
         picture = views.picture(index)
         mask = source_mask(
-            marks, camera, picture, pictures[index], size, out, device, report, pieces, left
+            marks, camera, picture, pictures[index], size, out, device, report, pieces
         )
         kept = views.masks[index]
         if kept is not None and not (mask & kept).any():
@@ -295,14 +295,12 @@ def marked(
     def segments(splats: Gaussians) -> list[Segment]:
         # Shrunk sides are rounded, so a click on the border could leave the picture.
         sides = camera.width, camera.height
-        at, away = (
-            [[min(side / full * v, side) for v, side, full in zip(point, sides, size, strict=True)]
-             for point in pairs(pixels)]
-            for pixels in (marks.at, marks.away)
-        )  # fmt: skip
+        at = [
+            [min(side / full * v, side) for v, side, full in zip(point, sides, size, strict=True)]
+            for point in pairs(marks.at)
+        ]
         pieces = [piece_around(splats, camera, point) for point in at]
-        left = nearer(splats, camera, at, away) if away else None
-        mask = of_source(pieces, left) if early is None else early
+        mask = of_source(pieces) if early is None else early
         lifted = lifted_segments(mask, splats, views, index, report)
         if not any((segment > 0.5).any() for segment in lifted):
             raise InputError(

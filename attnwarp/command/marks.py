@@ -56,11 +56,10 @@ class Marks:
     Args:
         box: x0, y0, x1, y1 around the object, in px of the source's picture.
         at: x, y of each point on the object, in px of the source's picture.
-        away: x, y of each point that is none of it, likewise; only with ``at``.
         segmenter: finder of the words, see :func:`attnwarp.editing.segment.load_segmenter`.
 
     Raises:
-        InputError: several marks are given, or the words have no letter, or ``away`` is alone.
+        InputError: several marks are given, or the words have no letter.
 
     Example:
         >>> from attnwarp.command.marks import Marks
@@ -74,12 +73,9 @@ class Marks:
     at: tuple[float, ...] | None = None
     words: str | None = None
     segmenter: str = "clip-parts"
-    away: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         given = self._given
-        if self.away and not self.at:
-            raise InputError("--not: takes away from what --at marks; give --at X,Y too")
         if len(given) > 1:
             raise InputError(f"{given[1]}: got {given[0]} too, expected one of the two")
         if self.words is not None and not self.words.strip():
@@ -174,7 +170,6 @@ def source_mask(
     device: str,
     report: Reporter,
     pieces: Sequence[Mask] = (),
-    nearer: Mask | None = None,
 ) -> Mask:
     """Compute the mask of the marked source view, (H, W) bool.
 
@@ -182,7 +177,6 @@ def source_mask(
         size: width and height, in px, of the file that coordinates refer to.
         pieces: (H, W) bool surface around each point of ``marks.at``,
             :func:`attnwarp.warp.piece_around`; all True if unknown, and colours alone decide.
-        nearer: (H, W) bool what ``marks.away`` leaves, :func:`attnwarp.warp.nearer`.
     """
     if marks.mask is not None:
         mask = read_mask(marks.mask, camera, beside=picture, option="--mask")
@@ -197,8 +191,6 @@ def source_mask(
             else snap(to_float(image), piece)
             for at, piece in zip(pairs(marks.at), pieces, strict=True)
         ])  # fmt: skip
-        if nearer is not None:
-            mask &= nearer
     else:
         mask = picture_mask(marks, image, size)
     write_marked(marks, image, mask, size, out)
@@ -229,8 +221,7 @@ def typed(marks: Marks, size: tuple[int, int]) -> str:
     """Write a box's or a point's coordinates with the size that they refer to, else nothing."""
     numbers = ",".join(f"{v:g}" for v in marks.box or ())
     if marks.at:
-        at, away = ([f"{x:g},{y:g}" for x, y in pairs(p)] for p in (marks.at, marks.away))
-        numbers = " ".join([*at, *(f"--not {one}" for one in away)])
+        numbers = " ".join(f"{x:g},{y:g}" for x, y in pairs(marks.at))
     return f"{numbers} of {size[0]} x {size[1]} px" if numbers else ""
 
 
@@ -257,8 +248,6 @@ def write_marked(
             cv2.rectangle(picture, low, high, color, width)
         for at in drawn(marks.at or ()):
             cv2.drawMarker(picture, at, color, cv2.MARKER_CROSS, 9, width)
-        for at in drawn(marks.away or ()):
-            cv2.drawMarker(picture, at, color, cv2.MARKER_TILTED_CROSS, 9, width)
     out.mkdir(parents=True, exist_ok=True)
     Workdir(out, "an edit").write_picture(MARKED, picture)
 

@@ -488,10 +488,9 @@ def check_marks(
     *,
     box: Sequence[float] | None = None,
     at: Sequence[float] | None = None,
-    away: Sequence[float] | None = None,
 ) -> None:
     """Refuse a box or a point outside a picture, and a box without area."""
-    for name, marks in (("--box", box), ("--at", at), ("--not", away)):
+    for name, marks in (("--box", box), ("--at", at)):
         limits = [width, height] * (len(marks or ()) // 2)
         if not all(0 <= v <= limit for v, limit in zip(marks or (), limits, strict=True)):
             raise InputError(

@@ -10,7 +10,7 @@ from attnwarp.warp.correspondence import (
 )
 from attnwarp.warp.depth import TAP_SPREAD, depth_slope, resize_depth
 from attnwarp.warp.features import FeatureWarp
-from attnwarp.warp.lifting import LiftedMask, lift_masks, nearer
+from attnwarp.warp.lifting import LiftedMask, lift_masks
 from attnwarp.warp.masks import resize_mask
 from attnwarp.warp.piece import piece_around
 from attnwarp.warp.rules import (
@@ -67,7 +67,6 @@ __all__ = [
     "in_front",
     "layer_size",
     "lift_masks",
-    "nearer",
     "opaque",
     "parts_of",
     "parts_read",

@@ -38,9 +38,6 @@ through an occluder, or is the rim of a splat behind an object's outline."""
 TRUST = 30.0
 """Strength of a fully visible splat's votes, in units of the strongest tie."""
 
-NEARBY, STEEP = 6 / 256, 4
-"""Radius of a point over the picture's longest side, and power of a step's cost."""
-
 OPPOSED = 0.25
 """Smallest distance from 1/2 of two views' votes on a splat that count as contradictory."""
 
@@ -185,57 +182,6 @@ def lift_masks(
     return LiftedMask(
         splats, near, backend, membership, seen, reached, inside & outside, tuple(agreement)
     )
-
-
-def nearer(
-    gaussians: Gaussians,
-    camera: Camera,
-    at: Sequence[Sequence[float]],
-    away: Sequence[Sequence[float]],
-    *,
-    near: float | None = None,
-) -> npt.NDArray[np.bool_]:
-    """Select the pixels whose splats are nearer to points of ``at`` than of ``away``, (H, W) bool.
-
-    A path goes from splat to splat. A step costs the more, the farther apart two splats are and the
-    less alike in normal and colour; its fourth power is added, so that one large step costs more
-    than many small ones, and a path avoids edges.
-
-    Args:
-        gaussians: splats of either kind.
-        camera: camera of the picture.
-        at, away: x, y of each point, in px of the picture.
-        near: near-plane depth, in scene units; by default a hundredth of the splats' median
-            distance.
-
-    Example:
-        >>> from attnwarp.trial import disc, view
-        >>> from attnwarp.warp import nearer
-        >>> bool(nearer(disc(0.3), view(), [(16, 16)], [(0, 0)])[16, 16])
-        True
-    """
-    from scipy.sparse.csgraph import dijkstra
-
-    height, width = camera.height, camera.width
-    y, x = np.mgrid[:height, :width] + 0.5
-    everywhere = np.ones((height, width), bool)
-    marked = []
-    for points in (at, away):
-        far = np.min([np.hypot(x - u, y - v) for u, v in points], axis=0)
-        disc = (far <= max(NEARBY * max(height, width), far.min())).astype(np.float32)
-        inside, total = _votes(gaussians, disc, everywhere, camera, near, "auto")
-        marked.append((inside > 0.5 * total) & (inside > 0.1 * inside.max()))
-    begun = marked[0] | marked[1]
-    if not begun.any():
-        return everywhere
-    steps = _ties(gaussians)
-    steps.data = (1e-6 - np.log(np.maximum(steps.data, 1e-12))) ** STEEP
-    first = dijkstra(
-        steps, directed=False, indices=np.flatnonzero(begun), return_predecessors=True,
-        min_only=True,
-    )[2]  # fmt: skip
-    own = np.where(first >= 0, (marked[0] & ~marked[1])[np.maximum(first, 0)], True)
-    return _shown(gaussians, own.astype(float), camera, near, "auto") > 0.5
 
 
 def _checked_mask(mask: Any, camera: Camera, name: str) -> npt.NDArray[np.float32]:

@@ -114,9 +114,7 @@ def marks_of(loaded: Loaded, name: str) -> Marks:
     """
     part = loaded.manifest.captures[name].mask or MaskPart()
     folder, source = (p and loaded.path(p) for p in (part.folder, part.source))
-    return Marks(
-        folder or None, source or None, part.box, part.at, part.words, part.segmenter, part.away
-    )
+    return Marks(folder or None, source or None, part.box, part.at, part.words, part.segmenter)
 
 
 def segments(

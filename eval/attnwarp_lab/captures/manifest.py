@@ -86,7 +86,6 @@ class MaskPart(Part):
     source: str | None = None
     box: tuple[float, float, float, float] | None = None
     at: tuple[float, ...] | None = None
-    away: tuple[float, ...] | None = None
     words: str | None = None
     segmenter: str = "clip-parts"
 

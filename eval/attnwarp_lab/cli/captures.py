@@ -80,7 +80,7 @@ class One:
             given = [f.name for part in (self, marking) for f in fields(part)
                      if getattr(part, f.name) != f.default]  # fmt: skip
             for name in given:
-                option = {"words": "where", "away": "not"}.get(name, name.replace("_", "-"))
+                option = {"words": "where"}.get(name, name.replace("_", "-"))
                 raise InputError(f"--{option}: needs --data; a manifest says it by itself")
             return None
         if self.instruction is None:
@@ -88,7 +88,7 @@ class One:
         marks = marking.marks()
         mask = {
             "folder": _place(marks.masks), "source": _place(marks.mask), "box": marks.box,
-            "at": marks.at, "away": marks.away, "words": marks.words, "segmenter": marks.segmenter,
+            "at": marks.at, "words": marks.words, "segmenter": marks.segmenter,
         }  # fmt: skip
         edit = {
             "instruction": self.instruction, "target": self.target_prompt,

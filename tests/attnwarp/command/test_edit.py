@@ -335,26 +335,24 @@ def test_a_click_that_marks_hardly_one_thing_says_so(tmp_path, rows, columns, sa
     assert all(said in text and "--box" in text and "marked.png" in text for text in texts)
 
 
-def test_clicks_add_up_and_a_click_away_takes_its_side(tmp_path):
+def test_clicks_add_up(tmp_path):
     """Oracle: the squares' own pixels."""
-    one, two, left = (np.zeros((32, 32), bool) for _ in range(3))
-    one[4:12, 4:12], two[16:28, 16:28], left[:, :20] = True, True, True
+    one, two = (np.zeros((32, 32), bool) for _ in range(2))
+    one[4:12, 4:12], two[16:28, 16:28] = True, True
     image = np.where((one | two)[..., None], [0.8, 0.1, 0.1], [0.2, 0.2, 0.2])
-    marks = Marks(at=(8, 8, 22, 22), away=(26, 26))
+    marks = Marks(at=(8, 8, 22, 22))
     mask = source_mask(
-        marks, cameras()[0], image, None, (32, 32), tmp_path, "cpu", SILENT, [one, two], left
+        marks, cameras()[0], image, None, (32, 32), tmp_path, "cpu", SILENT, [one, two]
     )
-    assert np.array_equal(mask, (one | two) & left)
+    assert np.array_equal(mask, one | two)
 
 
-def test_clicks_of_the_command_reach_two_things_and_leave_a_third(place, tmp_path):
-    done = run(
-        place, tmp_path / "a", "--ply", place / "splats.ply", "--at", "8,20", "--at", "20,8",
-        "--not", "8,24", *ONE,
-    )  # fmt: skip
+def test_clicks_of_the_command_reach_two_things(place, tmp_path):
+    clicks = ["--at", "8,20", "--at", "20,8"]
+    done = run(place, tmp_path / "a", "--ply", place / "splats.ply", *clicks, *ONE)
     assert done.exit_code == 0, done.output
     said = " ".join(done.stderr.split())
-    assert "--at 8,20 20,8 --not 8,24 of 32 x 32 px marks" in said
+    assert "--at 8,20 20,8 of 32 x 32 px marks" in said
     assert "if a part is missing, give --at X,Y again" in said
 
 
@@ -489,8 +487,6 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
         (("--at", "33,4"), "--at: got 33,4, expected px inside the picture of 32 x 32"),
         (("--box", "5,3,5,9"), "--box: got 5,3,5,9, expected X0,Y0,X1,Y1 with X0 < X1"),
         (("--at", "3"), "--at: got '3', expected X,Y in px, such as 64,68"),
-        (("--not", "3,4"), "--not: takes away from what --at marks; give --at X,Y too"),
-        (("--at", "3,4", "--not", "33,4"), "--not: got 33,4, expected px inside the picture of 32"),
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--segmenter", "clip-parts"), "--segmenter: needs --where, the words that it looks for"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp.warp import lift_masks, lifting, nearer, piece_around
+from attnwarp.warp import lift_masks, lifting, piece_around
 
 BALL = 1500
 """Discs on the ball."""
@@ -289,22 +289,3 @@ def test_pixels_that_are_not_kept_have_no_vote():
         return float(lifted.render(view)[77:81, 45:51].mean())
 
     assert share(None) > 0.5 > 0.1 > share([~patch])
-
-
-@pytest.mark.parametrize("edge", [48, 64])
-def test_what_is_nearer_ends_at_an_edge_of_colour_or_half_way_between_two_points(edge):
-    """Oracle: the wall's own columns, in a view that faces it; at 64 it has one colour."""
-    camera = Camera.look_at((0, -2, 0), (0, 0, 0), width=64, height=64, fov_y=53.13)
-    step = 2 / 64
-    x, z = np.meshgrid(*[(np.arange(64) + 0.5) * step - 1] * 2)
-    place = torch.tensor(np.stack([x, 0 * x, z], -1).reshape(-1, 3), dtype=torch.float32)
-    color = torch.where(place[:, :1] < edge * step - 1, torch.tensor([[0.9, 0.1, 0.1]]), 0.2)
-    wall = Gaussians(
-        "2d", place, torch.tensor([[0.5**0.5, 0.5**0.5, 0, 0]]).repeat(4096, 1),
-        torch.full((4096, 2), step), torch.full((4096,), 0.99), Gaussians.sh_from_rgb(color),
-    )  # fmt: skip
-    found = nearer(wall, camera, [(12, 32)], [(56, 32)])
-    border = edge if edge < 56 else (12 + 56) // 2
-    near = slice(24, 40)  # rows, as half-way lines of other metrics bend
-    assert found[near, : border - 3].mean() > 0.99
-    assert found[near, border + 3 : -1].mean() < 0.01
