@@ -113,9 +113,9 @@ class Cases:
 
     def answer(self, image: Image, case: int, part: int) -> int:
         """The answer that a part is nearest to; the last is the picture before."""
-        return int(
-            deltaE_ciede2000(self.lab(image, case, part), self.true[case][part - 1]).argmin()
-        )
+        true = self.true[case][part - 1]
+        own = np.broadcast_to(self.lab(image, case, part), true.shape)
+        return int(deltaE_ciede2000(own, true).argmin())
 
     def drawn(self, unet: Any, case: int, noise: Tensor) -> list[int]:
         """Return the answer that the noise selects for each part."""

@@ -12,6 +12,7 @@ from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES
 from attnwarp_eval.scene.base import linear_rgb
 from training import steps
+from training.assess.part_answers import Cases
 from training.editors import parts
 from training.editors.parts import PALETTE, START, PartsNet, PartsPool, Plan
 from training.worlds import recolors, render
@@ -85,6 +86,17 @@ def test_light_times_colour_is_the_picture_that_rays_give():
     color = np.where(made["parts"][0, 0, ..., None] > 0, white, 1.0)
     product = np.rint(255 * to_srgb(made["light"][0].astype(float) * color))
     assert np.abs(product - picture).max() <= 1
+
+
+def test_the_judge_names_the_answers_that_are_painted_and_the_picture_before(tokenizer):
+    pool = PartsPool(halves_table(1), tokenizer)
+    cases = Cases({}, pool)
+    assert cases.touching(0) == [(1, 2)]
+    for painted in ([0, 7], [6, 2]):
+        colors = pool.palette[painted + [0] * 14][None]
+        image = cases.picture(pool.colored(cases.cuts[:1], colors, 64)[0])
+        assert [cases.answer(image, 0, part) for part in (1, 2)] == painted
+    assert [cases.answer(cases.before[0], 0, part) for part in (1, 2)] == [len(PALETTE)] * 2
 
 
 @pytest.mark.slow
