@@ -105,7 +105,7 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
     depths = np.load(data / "depth.npz") if (data / "depth.npz").is_file() else {}
     history = [json.loads(line) for line in (fit / "history.jsonl").read_text().splitlines()]
     stems = file_stems(dataset.cameras)
-    views = {}
+    views: dict[str, dict[str, Any]] = {}
     for path in sorted((fit / "held_out").glob("*.png")):
         pair = read_image(path)[..., :3].astype(np.float64) / 255
         height, width = pair.shape[0], pair.shape[1] // 2
@@ -162,7 +162,7 @@ def chose(settings: dict[str, Any], held_out: list[str]) -> list[str]:
     ]
 
 
-def against(view: Any, behind: np.ndarray, depth: np.ndarray) -> dict[str, float]:
+def against(view: Any, behind: np.ndarray, depth: np.ndarray) -> dict[str, float | None]:
     """Errors of a render at a view's true depth, infinite in the sky; ``behind``: its splats' alpha
     alone.
     """
@@ -174,7 +174,7 @@ def against(view: Any, behind: np.ndarray, depth: np.ndarray) -> dict[str, float
         "depth_wrong": float((error[shown] > 0.1).mean()),
         "surface_lost": float(1 - shown.mean()),
         "sky_with_depth": float((alpha[~solid] >= OPAQUE).mean()) if (~solid).any() else 0.0,
-        "sky_covered": float((behind[~solid] >= OPAQUE).mean()) if (~solid).any() else 1.0,
+        "sky_covered": float((behind[~solid] >= OPAQUE).mean()) if (~solid).any() else None,
     }
 
 
@@ -205,14 +205,19 @@ def row(name: str, fits: list[dict[str, Any]], apart: set[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def rightly(view: dict[str, float]) -> float:
+    """Share of a view's surface with a depth within 10 %."""
+    return (1 - view["depth_wrong"]) * (1 - view["surface_lost"])
+
+
 def depth_row(name: str, fits: list[dict[str, Any]]) -> str:
     """A line of the table of scenes whose depth is known."""
     figures = ("depth_error", "depth_wrong", "surface_lost", "sky_with_depth", "sky_covered")
-    means = [
-        statistics.mean(view[figure] for fit in fits for view in fit["views"].values())
-        for figure in figures
-    ]
-    return "| " + " | ".join([name, *(f"{100 * mean:.1f} %" for mean in means)]) + " |"
+    views = [view for fit in fits for view in fit["views"].values()]
+    known = [[view[figure] for view in views if view[figure] is not None] for figure in figures]
+    known.append([rightly(view) for view in views])
+    cells = [f"{100 * statistics.mean(values):.1f} %" if values else "" for values in known]
+    return "| " + " | ".join([name, *cells]) + " |"
 
 
 def report(results: dict[str, list[dict[str, Any]]]) -> str:
@@ -236,20 +241,20 @@ def report(results: dict[str, list[dict[str, Any]]]) -> str:
             "",
             "Against the true depth: the median relative error and the share off by more than 10 %,"
             " both where alpha is at least 0.5; surface where it is less; sky where it is not, and"
-            " where the sky's splats alone are opaque.",
+            " where the sky's splats alone are opaque; surface with a depth within 10 %.",
             "",
             "| fit | median error | off by 10 % | surface without depth | sky with depth |"
-            " sky covered |",
-            "|---|---|---|---|---|---|",
+            " sky covered | surface right |",
+            "|---|---|---|---|---|---|---|",
             *(depth_row(name, fits) for name, fits in known.items()),
         ]
     lines += [
         "",
         "After less before, paired by seed and held-out view that chooses in neither: mean (least"
-        " and largest seed). Depth error, distance from tracks and CPU: after over before."
+        " and largest seed). Distance from tracks and CPU: after over before."
         " Low: below the horizon.",
         "",
-        "| capture | PSNR, dB | depth error | tracks | CPU | sky splats (of them low), before |"
+        "| capture | PSNR, dB | surface right, points | tracks | CPU | sky splats (low), before |"
         " after |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -273,15 +278,13 @@ def compared(name: str, before: list[dict[str, Any]], after: list[dict[str, Any]
         if new["tracks"] is not None:
             strays.append(new["tracks"] / old["tracks"])
         if "depth_error" in pairs[0][0]:
-            was, now = (
-                sum(view["depth_error"] for view in fit["views"].values()) for fit in (old, new)
-            )
-            errors.append(now / was)
+            right = [statistics.mean(map(rightly, fit["views"].values())) for fit in (old, new)]
+            errors.append(100 * (right[1] - right[0]))
     cells = [name] + [
         f"{statistics.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
         if values
         else ""
-        for values, form in ((gains, "+.2f"), (errors, ".2f"), (strays, ".2f"), (costs, ".2f"))
+        for values, form in ((gains, "+.2f"), (errors, "+.1f"), (strays, ".2f"), (costs, ".2f"))
     ]
     for fits in (before, after):
         low = sum(fit["below_horizon"] for fit in fits)
