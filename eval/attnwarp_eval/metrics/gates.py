@@ -41,6 +41,7 @@ GATES: Mapping[str, Margin] = {
     "warp.feature_all_accepted": Margin(1e-3, 0.02),
     "occlusion.precision": Margin(5e-3),
     "occlusion.recall": Margin(5e-3),
+    "labels.net": Margin(0.02),
     "labels.right": Margin(0.02),
     "labels.wrong": Margin(0.02),
     "labels.none": Margin(0.02),
