@@ -52,7 +52,9 @@ class LabelReport(ProbeReport):
             for n in results.study.variants
             if n in names
         ]
-        if rows:
+        records = [record for _, record in results.finished(self.name)]
+        # Older results lack it, whose page has the shares elsewhere.
+        if any("labels.net" in view.metrics for record in records for view in record.views):
             yield Section("Tokens", [TOKENS], [Table(["variant", *self.columns], rows)])
         edges = edges_of(results.study, self.name)
         if edges is None:
