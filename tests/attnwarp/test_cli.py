@@ -326,7 +326,7 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
         lines = (tmp_path / name / "history.jsonl").read_text().splitlines()
         return [json.loads(line)["psnr"] for line in lines]
 
-    once = ("--threads", 1, "--iterations", 30)
+    once = ("--threads", 1, "--iterations", 30, "--set", "background=random")
     flat = ("--kind", "2dgs", "--set", "sh_degree=1", "--set", "sh_every=0.33")
     assert in_process("fit", data, *once, *flat, "--out", tmp_path / "a").exit_code == 0
     splats = tmp_path / "a" / "splats.ply"

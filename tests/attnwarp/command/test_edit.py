@@ -217,7 +217,8 @@ def test_a_captures_masks_and_its_fits_exposures_hold_in_the_edit(place, tmp_pat
     scene = json.loads((data / "transforms.json").read_text())
     scene["frames"][1]["mask_path"] = "mask.png"
     (data / "transforms.json").write_text(json.dumps(scene))
-    fitted = ["--iterations", 30, "--hold-out", 0, "--set", "exposure=true", "--kind", "2dgs"]
+    fitted = ["--iterations", 30, "--hold-out", 0, "--kind", "2dgs",
+              "--set", "exposure=true", "--set", "background=random"]  # fmt: skip
     done = runner.invoke(app, ["fit", str(data), "--out", str(tmp_path / "fit"), *map(str, fitted)])
     assert done.exit_code == 0, done.output
     seen, advance = {}, Tuning.advance
