@@ -121,7 +121,7 @@ def test_the_gpu_backend_fits_as_well_as_the_cpus(kind):
     growing = {"densify": True, "densify_from": 0.2, "densify_every": 0.2, "grow_gradient": 1e-5}
     psnr, _, count = reached("gpu", **growing, max_splats=60)
     assert psnr == pytest.approx(reached("cpu", **growing, max_splats=60)[0], abs=1)
-    assert count == 60
+    assert len(start) == 40 < count <= 60  # what no view shows goes after the last refinement
 
 
 @pytest.mark.slow
