@@ -59,7 +59,7 @@ class Marks:
         segmenter: finder of the words, see :func:`attnwarp.editing.segment.load_segmenter`.
 
     Raises:
-        InputError: several marks are given, or the words have no letter.
+        InputError: several marks are given, the words have no letter, or a point lacks its y.
 
     Example:
         >>> from attnwarp.command.marks import Marks
@@ -78,6 +78,8 @@ class Marks:
         given = self._given
         if len(given) > 1:
             raise InputError(f"{given[1]}: got {given[0]} too, expected one of the two")
+        if len(self.at or ()) % 2:
+            raise InputError(f"--at: got {len(self.at or ())} numbers, expected X,Y of each point")
         if self.words is not None and not self.words.strip():
             raise InputError(f"--where: got {self.words!r}, expected words such as 'bear'")
 

@@ -68,6 +68,10 @@ def small_mask(folder, manifest):
     Image.new("RGB", (32, 16), "white").save(folder / "captures/two/masks/1.png")
 
 
+def half_a_point(folder, manifest):
+    manifest["captures"]["two"]["mask"] = {"at": [8, 8, 20]}
+
+
 def no_folder(folder, manifest):
     manifest["captures"]["two"]["data"] = "captures/three"
 
@@ -87,6 +91,7 @@ MISTAKES = {
     same_capture: "captures.two: has the pictures and cameras of 'one'; name a capture once",
     moved_splats: "captures.two.splats.2d: ",
     small_mask: "1.png: got 16 x 32 (height x width), expected the aspect ratio of 32 x 32",
+    half_a_point: "--at: got 3 numbers, expected X,Y of each point",
     no_folder: "captures.two: ",
     no_encoder: "encoders.clip: ",
     wrong_editor: "variants.IGS2GS: igs2gs takes an editor guided by a picture",
@@ -96,7 +101,9 @@ MISTAKES = {
 @pytest.mark.parametrize(
     "mistake",
     [
-        pytest.param(m, marks=() if m in (outside, wrong_editor) else pytest.mark.door)
+        pytest.param(
+            m, marks=() if m in (outside, wrong_editor, half_a_point) else pytest.mark.door
+        )
         for m in MISTAKES
     ],
 )
