@@ -36,26 +36,46 @@ def pick(edit: EditSpec, answer: str | None = None) -> AnswerSpec | None:
     raise ValueError(f"edit {edit.name!r}: no answer {answer!r}; it has {names}")
 
 
+def reshapes(edit: EditSpec, answer: str | None = None) -> bool:
+    """Return True if an edit, or one of its answers, changes, adds or removes a shape.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> any(reshapes(edit) for edit in load_scene("bear").edits)
+        False
+    """
+    does = pick(edit, answer) or edit
+    return bool(does.add or does.remove or any(change.shape for change in does.changes))
+
+
 def apply(spec: SceneSpec, edit: EditSpec, answer: AnswerSpec | None = None) -> SceneSpec:
-    """Apply an edit; the resulting scene has no edits.
+    """Apply an edit; the resulting scene has no edits, and what is added comes last.
 
     Raises:
-        ValueError: the edit changes an unknown object, or its result is not a valid scene.
+        ValueError: the edit changes or removes an unknown object, adds one of a name that is
+            taken, or its result is not a valid scene.
     """
     does = answer or edit
-    objects = list(spec.objects)
-    places = {item.name: k for k, item in enumerate(objects)}
+    objects = {item.name: item for item in spec.objects}
+    for name in (*(change.object for change in does.changes), *does.remove):
+        if name not in objects:
+            raise ValueError(f"edit {edit.name!r}: there is no object {name!r}")
     for change in does.changes:
-        if change.object not in places:
-            raise ValueError(f"edit {edit.name!r}: there is no object {change.object!r}")
-        k = places[change.object]
-        objects[k] = changed(objects[k], change)
+        objects[change.object] = changed(objects[change.object], change)
+    for name in does.remove:
+        objects.pop(name, None)
+    for item in does.add:
+        if item.name in objects:
+            raise ValueError(f"edit {edit.name!r}: adds a second object {item.name!r}; rename it")
+        objects[item.name] = item
+    if not objects:
+        raise ValueError(f"edit {edit.name!r}: removes every object; keep one")
     light = {} if does.bounces is None else {"bounces": does.bounces}
     return spec.model_copy(
         update={
             "name": "-".join([spec.name, edit.name, *([answer.name] if answer else [])]),
             "title": f"{spec.title}: {edit.instruction}",
-            "objects": tuple(objects),
+            "objects": tuple(objects.values()),
             "lights": spec.lights if does.lights is None else does.lights,
             "appearance": spec.appearance.model_copy(update=light),
             "edits": (),
@@ -71,6 +91,8 @@ def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
             object has no texture to change.
     """
     values = item.model_dump(mode="json", exclude_unset=True)
+    if change.shape is not None:
+        values["shape"] = change.shape.model_dump(mode="json", exclude_unset=True)
     shows = change.material or item.material
     if (change.paint or change.texture) and (item.emission or not isinstance(shows, TEXTURED)):
         kind = "a lamp" if item.emission else shows.type

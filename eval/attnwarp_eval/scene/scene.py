@@ -165,7 +165,7 @@ class Scene:
         )
 
     def edited(self, name: str, answer: str | None = None) -> Scene:
-        """The scene after an edit: the same shapes and cameras, other surfaces or lights.
+        """The scene after an edit: the same cameras, other surfaces, shapes or lights.
 
         Args:
             name: an edit of :attr:`edits`.

@@ -192,14 +192,20 @@ class AppearanceSpec(Spec):
     spp: int = Field(default=16, ge=1, le=65536)
 
 
-class ObjectChange(Spec):
-    """Change of one object by an edit. The shape is unchanged.
+CHANGES = ("shape", "texture", "material", "recolor", "paint")
+"""Keys of a change, any of which changes something."""
 
-    ``recolor`` replaces colours of the object by others; ``paint`` makes all its colours shades
-    of one, except those of the parts listed under ``keep``.
+
+class ObjectChange(Spec):
+    """Change of one object by an edit.
+
+    ``shape`` puts another shape in place of the object's; ``recolor`` replaces colours of the
+    object by others; ``paint`` makes all its colours shades of one, except those of the parts
+    listed under ``keep``.
     """
 
     object: str
+    shape: ShapeSpec | None = None
     texture: Texture | None = None
     material: Material | None = None
     recolor: dict[Color, Color] = Field(default_factory=dict)
@@ -208,12 +214,11 @@ class ObjectChange(Spec):
 
     @model_validator(mode="after")
     def _one_way_of_colouring(self) -> ObjectChange:
-        given = [
-            name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)
-        ]
+        given = [name for name in CHANGES if getattr(self, name)]
         if not given:
             raise ValueError(
-                "got a change that changes nothing; add a texture, a material, recolor or paint"
+                "got a change that changes nothing; add a shape, a texture, a material, recolor or"
+                " paint"
             )
         if self.paint and (self.recolor or self.texture):
             raise ValueError("got paint beside recolor or texture; keep one of them")
@@ -228,6 +233,8 @@ class AnswerSpec(Spec):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
     target: str
     changes: tuple[ObjectChange, ...] = ()
+    add: tuple[ObjectSpec, ...] = ()
+    remove: tuple[str, ...] = ()
     lights: tuple[LightSpec, ...] | None = None
     bounces: Bounces | None = None
 
@@ -235,8 +242,9 @@ class AnswerSpec(Spec):
 class EditSpec(Spec):
     """An edit with a known result: instruction, prompts, and changes of the scene.
 
-    An ambiguous instruction has several equally right ``answers``. ``bounces`` applies to the
-    edited scene's pictures; the default is the scene's number.
+    ``add`` and ``remove`` are objects and names of objects. An ambiguous instruction has several
+    equally right ``answers``. ``bounces`` applies to the edited scene's pictures; the default is
+    the scene's number.
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
@@ -244,17 +252,19 @@ class EditSpec(Spec):
     source: str
     target: str
     changes: tuple[ObjectChange, ...] = ()
+    add: tuple[ObjectSpec, ...] = ()
+    remove: tuple[str, ...] = ()
     lights: tuple[LightSpec, ...] | None = None
     bounces: Bounces | None = None
     answers: tuple[AnswerSpec, ...] = ()
 
     @model_validator(mode="after")
     def _does_something(self) -> EditSpec:
-        own = bool(self.changes) or self.lights is not None
+        own = bool(self.changes or self.add or self.remove) or self.lights is not None
         if own == bool(self.answers):
             raise ValueError(
-                "got an edit with both or neither of its own changes (or lights) and answers;"
-                " keep one"
+                "got an edit with both or neither of its own changes (add, remove, lights) and"
+                " answers; keep one"
             )
         return self
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp_eval.truth.raycast import Geometry
+from attnwarp_eval.truth.raycast import Geometry, RayHits
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 Array = npt.NDArray[np.float64]
@@ -58,11 +60,7 @@ def two_view(
     shape = (target.height, target.width)
     status = status.reshape(shape)
 
-    corner = _corner_status(geometry, source, target)
-    same = np.ones(shape, dtype=bool)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            same &= corner[dy : dy + shape[0], dx : dx + shape[1]] == status
+    same = as_corners(status, _corner_status(geometry, source, target))
     with np.errstate(invalid="ignore"):
         grazing = (hits.cosine < GRAZING_COSINE) | (cosine.reshape(shape) < GRAZING_COSINE)
     label = np.where(status >= _OUTSIDE, NONE, status).astype(np.uint8)
@@ -119,13 +117,33 @@ def _status(
     return status, cosine
 
 
+def corner_hits(geometry: Geometry, camera: Camera) -> RayHits:
+    """First hits at the (H + 1)(W + 1) corners of a camera's pixels, row by row."""
+    grid = np.stack(
+        np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)), axis=-1
+    )
+    directions = (camera.directions(grid) @ camera.rotation).reshape(-1, 3)
+    return geometry.trace_rays(camera.position, directions)
+
+
+def as_corners(center: npt.NDArray[Any], corner: npt.NDArray[Any]) -> Mask:
+    """(H, W) bool: pixels whose four corners have the value of their centre.
+
+    Args:
+        center: (H, W).
+        corner: (H + 1, W + 1).
+    """
+    h, w = center.shape
+    same = np.ones((h, w), dtype=bool)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            same &= corner[dy : dy + h, dx : dx + w] == center
+    return same
+
+
 def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.NDArray[np.uint8]:
     """(H + 1, W + 1) status at the corners of the target's pixels."""
-    grid = np.stack(
-        np.meshgrid(np.arange(target.width + 1.0), np.arange(target.height + 1.0)), axis=-1
-    )
-    directions = (target.directions(grid) @ target.rotation).reshape(-1, 3)
-    hits = geometry.trace_rays(target.position, directions)
+    hits = corner_hits(geometry, target)
     _, _, inside = _project(source, hits.point)
     status, _ = _status(
         geometry, hits.point, hits.normal, hits.primitive_id, hits.valid, inside, source

@@ -9,27 +9,37 @@ import numpy.typing as npt
 
 from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.spec import ObjectChange
+from attnwarp_eval.scene.spec import CHANGES, ObjectChange
 from attnwarp_eval.truth import Hits
+from attnwarp_eval.truth.shapes import ShapeLabels
 
 
 def touched(scene: Scene, name: str, answer: str | None = None) -> list[int]:
-    """Ids of objects with edited surfaces; other objects change only in their light."""
+    """Ids of objects that an edit changes or removes; others change only in their light."""
     edit = scene.edit(name)
     does = pick(edit, answer) or edit
-    return [scene.object_names.index(change.object) for change in does.changes]
+    names = [*(change.object for change in does.changes), *does.remove]
+    return [scene.object_names.index(name) for name in names]
 
 
 def edit_mask(
-    scene: Scene, name: str, hits: Hits, answer: str | None = None
+    scene: Scene,
+    name: str,
+    hits: Hits,
+    answer: str | None = None,
+    after: ShapeLabels | None = None,
 ) -> npt.NDArray[np.bool_]:
     """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the
     light.
+
+    Args:
+        after: labels of the view, for an edit that changes shapes: what is new counts too.
     """
     edit = scene.edit(name)
     if (pick(edit, answer) or edit).lights is not None:
         return np.ones(hits.object_id.shape, dtype=bool)
-    return np.isin(hits.object_id, touched(scene, name, answer))
+    mask = np.isin(hits.object_id, touched(scene, name, answer))
+    return mask if after is None else mask | after.new
 
 
 def describe(scene: Scene) -> str:
@@ -46,6 +56,8 @@ def describe(scene: Scene) -> str:
         ]
         for does in edit.answers or (edit,):
             what = [f"{change.object} ({', '.join(_kinds(change))})" for change in does.changes]
+            what += [f"{item.name} (added)" for item in does.add]
+            what += [f"{name} (removed)" for name in does.remove]
             if does.lights is not None:
                 what.append("the light")
             label = f"answer {does.name}" if edit.ambiguous else "changes"
@@ -54,6 +66,6 @@ def describe(scene: Scene) -> str:
 
 
 def _kinds(change: ObjectChange) -> Iterator[str]:
-    for name in ("texture", "material", "recolor", "paint"):
+    for name in CHANGES:
         if getattr(change, name):
             yield name

@@ -199,7 +199,7 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
         (
             "recolor: {'#c04020': '#2040c0'}",
             "keep: []",
-            r"changes nothing; add a texture, a material, recolor or paint",
+            r"changes nothing; add a shape, a texture, a material, recolor or",
         ),
         (
             "recolor: {'#c04020': '#2040c0'}",

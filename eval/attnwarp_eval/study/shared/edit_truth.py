@@ -13,11 +13,12 @@ import numpy.typing as npt
 
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene.edits import pick
+from attnwarp_eval.scene.edits import pick, reshapes
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask
+from attnwarp_eval.truth.shapes import ShapeEdit, ShapeLabels
 from attnwarp_eval.world import World, changed, world
 
 Image = npt.NDArray[np.float32]
@@ -176,15 +177,22 @@ def _edit_truth(
     title = edit.partition("=")[0]
     # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
     originals = {view: of.image(view, spp) for view in views}
-    pictures = {}
+    pictures: dict[str, dict[str, Image]] = {}
+    new: dict[tuple[str, str], ShapeLabels] = {}
     for name, answer in answers:
         edited = of.scene.edited(title, answer)
+        if reshapes(of.scene.edit(title), answer):
+            shapes = ShapeEdit(of.scene, edited, of.geometry)
+            new |= {(name, view): shapes.labels(of.camera(view)) for view in views}
         pictures[name] = {
             view: to_srgb(appearance(edited, of.camera(view), spp=spp, seed=0)) for view in views
         }
     hits = {view: of.geometry.trace(of.camera(view)) for view in views}
     masks = {
-        name: {view: edit_mask(of.scene, title, hits[view], answer) for view in views}
+        name: {
+            view: edit_mask(of.scene, title, hits[view], answer, new.get((name, view)))
+            for view in views
+        }
         for name, answer in answers
     }
     union = {
