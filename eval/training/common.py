@@ -18,7 +18,6 @@ from torch.nn import functional
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import write_atomically
-from training.log import Entry, append, cut_log, log_path
 
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)
@@ -124,16 +123,13 @@ def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """A training run that can be killed and resumed: its state is written after epochs, and the
-    losses of each to a log (:mod:`training.log`).
+    """A training run that can be killed and resumed: its state is written after epochs.
 
     Attributes:
         state: everything that has a ``state_dict``, by name.
         recipe: the other settings of the result, see :func:`settings`; written into the checkpoint,
             which can be resumed with no other.
         every: least seconds between two checkpoints; 0 writes one after each epoch.
-        steps: in an epoch, for the log; None where the recipe does not count them.
-        spent: seconds that went before the first epoch.
     """
 
     path: Path
@@ -141,81 +137,36 @@ class Run:
     epochs: int
     recipe: Mapping[str, Any]
     every: float = 0.0
-    device: str = "one CPU core"
-    steps: int | None = None
-    spent: float = 0.0
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
         """Run the epochs that are left; each draws from generators seeded by its number, so a
         resumed run is the same.
 
         Raises:
-            InputError: the checkpoint is of another recipe, or from before recipes were written
-                into them.
+            InputError: the checkpoint is of another recipe.
         """
-        first, seconds, unsaved = 0, self.spent, 0.0
-        recipe = {"epochs": self.epochs, **self.recipe}
+        first, saved = 0, time.perf_counter()
+        recipe = json.loads(json.dumps({"epochs": self.epochs, **self.recipe}))  # tuples as lists
         if self.path.exists():
             stored = torch.load(self.path, weights_only=True, map_location="cpu")
-            self._same_recipe(stored.get("recipe"), recipe)
+            before = json.loads(stored["recipe"])
+            others = [name for name in {**recipe, **before} if before.get(name) != recipe.get(name)]
+            if others:
+                names = ", ".join(others)
+                raise InputError(
+                    f"{self.path}: was made with other {names}; remove it to train from the start"
+                )
             for name, thing in self.state.items():
                 thing.load_state_dict(stored[name])
-            first, seconds = int(stored["epoch"]), float(stored["seconds"])
-        log = log_path(self.path)
-        cut_log(log, first)
+            first = int(stored["epoch"])
         for number in range(first, self.epochs):
             start = time.perf_counter()
-            losses = epoch(number)
-            spent = time.perf_counter() - start
-            seconds, unsaved = seconds + spent, unsaved + spent
-            steps = None if self.steps is None else self.steps * (number + 1)
-            append(log, Entry(self.path.stem, number + 1, steps, seconds, losses))
-            words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
-            print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
-            if number + 1 < self.epochs and unsaved < self.every:
+            words = ", ".join(f"{k} {v:.4g}" for k, v in epoch(number).items())
+            now = time.perf_counter()
+            print(f"epoch {number + 1}/{self.epochs}: {words}, {now - start:.0f} s", flush=True)
+            if number + 1 < self.epochs and now - saved < self.every:
                 continue
-            unsaved = 0.0
+            saved = now
             states = {name: thing.state_dict() for name, thing in self.state.items()}
-            about = {
-                "epoch": number + 1,
-                "seconds": seconds,
-                "recipe": json.dumps(recipe),
-                "device": self.device,
-            }
+            about = {"epoch": number + 1, "recipe": json.dumps(recipe)}
             write_atomically(self.path, functools.partial(torch.save, {**states, **about}))
-
-    def _same_recipe(self, stored: str | None, recipe: Mapping[str, Any]) -> None:
-        remedy = "remove it to train from the start"
-        if stored is None:
-            raise InputError(
-                f"{self.path}: does not say which recipe it was made by, so it cannot be gone on with; {remedy}"
-            )
-        before, now = json.loads(stored), json.loads(json.dumps(recipe))  # tuples are lists there
-        for name in (*now, *before):
-            if (name in before) != (name in now) or before.get(name) != now.get(name):
-                stored_value, new_value = (
-                    _short(one[name]) if name in one else "nothing" for one in (before, now)
-                )
-                raise InputError(
-                    f"{self.path}: was made with {name} = {stored_value}, got {new_value}; {remedy}, or restore the setting"
-                )
-
-
-def minutes(*paths: Path) -> float | None:
-    """Total training time of some checkpoints; None if one is missing or does not record it."""
-    total = 0.0
-    for path in paths:
-        seconds = (
-            torch.load(path, weights_only=True, map_location="cpu").get("seconds")
-            if path.exists()
-            else None
-        )
-        if seconds is None:
-            return None
-        total += seconds
-    return total / 60
-
-
-def _short(value: Any, most: int = 120) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= most else f"{text[:most]}..."

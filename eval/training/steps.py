@@ -77,13 +77,12 @@ def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
 
 def train_steps(
     net: torch.nn.Module, plan: Plan, tasks: Sequence[Task], checkpoint: Path, recipe: Mapping[str, Any],
-    device: torch.device, spent: float = 0.0, warm: int = WARM,
+    device: torch.device, warm: int = WARM,
 ) -> None:  # fmt: skip
     """Take a stage's steps, or those that are left, with an average of the weights beside them.
 
     Args:
         recipe: inputs that decide the result, see :class:`training.common.Run`.
-        spent: seconds that went before the first step.
         warm: steps until the rate is at its peak.
     """
     recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states
@@ -107,19 +106,7 @@ def train_steps(
         return {key: float(value) / counts[key] for key, value in sums.items()}
 
     state = {"net": net, "average": stepper.average, "optimizer": stepper.optimizer}
-    epochs = plan.steps // STEPS_AN_EPOCH
-    Run(
-        checkpoint, state, epochs, recipe, every=SAVE_SECONDS, device=name_of(device), steps=STEPS_AN_EPOCH, spent=spent
-    ).train(epoch)  # fmt: skip
-
-
-def name_of(device: torch.device) -> str:
-    """A device in words."""
-    if device.type == "cuda":
-        return f"one {torch.cuda.get_device_name(device)}"
-    return (
-        "one CPU core" if torch.get_num_threads() == 1 else f"{torch.get_num_threads()} CPU cores"
-    )
+    Run(checkpoint, state, plan.steps // STEPS_AN_EPOCH, recipe, every=SAVE_SECONDS).train(epoch)
 
 
 def minibatches(

@@ -1,18 +1,9 @@
-"""Trainings of the recipes on pictures of two worlds, and how one is stopped."""
+"""Interruption of a training at a call."""
 
 import itertools
 from contextlib import contextmanager
 
 import pytest
-
-from training.worlds import editing_pairs
-
-
-def draw_pairs(folder, split="edit-train"):
-    """Draw the pictures of the first two worlds of a split; the folder."""
-    for index in range(2):
-        editing_pairs._make(editing_pairs._path(folder, split, index), index, split)
-    return folder
 
 
 @contextmanager

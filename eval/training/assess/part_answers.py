@@ -5,9 +5,11 @@ noise, and where its answer lives: what carried features bring, by kind, by a tr
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from dataclasses import replace
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,14 +23,12 @@ from attnwarp.camera import Camera
 from attnwarp.editing.editor import Image, edit
 from attnwarp.editing.latents import BLOCK
 from attnwarp.editing.recording import RecordingPlan, record
+from attnwarp.io.file import write_atomically
 from attnwarp.methods.algorithms.attention_warping import AttentionWarpingSettings, a_t, inject
-from attnwarp.warp import Surface, warp_surfaces
+from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from attnwarp_eval.colors import to_linear, to_srgb
-from training.assess.card_sections import Kept
-from training.assess.figures import Figure, figure
 from training.editors.parts import SENTENCES, PartsPool
 from training.worlds import recolors
-from training.worlds.view_warps import EXACT
 
 SIZE, STEPS, BATCH = 64, 20, 16
 
@@ -41,8 +41,64 @@ DIFFER = 10.0
 CARRIED = partial(a_t, s=AttentionWarpingSettings(a0=1.0, decay="late"))
 """Weight of the default of an edit."""
 
+EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
+
 Marks = dict[str, list[tuple[float, int]]]
 """Values and the worlds that they are of."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A share of right answers.
+
+    Attributes:
+        what: the question.
+        value: the share.
+        low, high: 95 % interval, bootstrapped over worlds: answers of one world are not independent. Where all
+            answers are right or all wrong, the binomial interval of as many answers as worlds (Clopper-Pearson).
+        count: answers.
+    """
+
+    what: str
+    value: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        return f"{100 * self.value:.0f} % ({100 * self.low:.0f} to {100 * self.high:.0f})"
+
+
+def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike) -> Figure:
+    """A figure from one answer a question, grouped by world."""
+    values, groups = np.asarray(right, dtype=np.float64), np.asarray(worlds)
+    sums = [(values[groups == g].sum(), (groups == g).sum()) for g in np.unique(groups)]
+    table = np.array(sums)
+    rng = np.random.default_rng(0)
+    drawn = table[rng.integers(len(table), size=(2000, len(table)))].sum(axis=1)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
+    tail = 0.025 ** (1 / len(table))
+    if (values == 0).all():
+        high = 1 - tail
+    elif (values == 1).all():
+        low = tail
+    return Figure(what, float(values.mean()), float(low), float(high), len(values))
+
+
+class Kept:
+    """Results of a long measurement in a file, by name: one that was stopped goes on where it was."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+
+    def get(self, name: str, compute: Callable[[], Any]) -> Any:
+        """The result of that name, computed and written if it is not there; it comes as JSON gives it back."""
+        if name not in self.results:
+            self.results[name] = json.loads(json.dumps(compute()))
+            text = json.dumps(self.results)
+            write_atomically(self.path, lambda stream: stream.write(text.encode()))
+        return self.results[name]
 
 
 class Mirrored:

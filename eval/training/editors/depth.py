@@ -18,9 +18,7 @@ import numpy.typing as npt
 import torch
 from tokenizers import Tokenizer
 
-from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
-from training.assess.pictures import Pictures, Row
 from training.editors.answers import codes
 from training.editors.net import (
     HEADS,
@@ -159,24 +157,6 @@ def draw_prompt(look: Sequence[int], rng: np.random.Generator) -> tuple[str, npt
         text = sentence(values, rng)
         if text.lower() not in reserved_prompts():
             return text, np.array(values)
-
-
-class Prompts(Pictures):
-    """Depth maps of worlds and the pictures that belong to them, one by one."""
-
-    def depth(self, row: Row) -> npt.NDArray[np.float32]:
-        """(S, S) depth map of a row."""
-        y, x, n = row.corner
-        depth = self.worlds.depth[row.world, row.view, y : y + n * self.size, x : x + n * self.size]
-        # A mean over an edge would be a depth where nothing is.
-        return depth[n // 2 :: n, n // 2 :: n]
-
-    def control(self, row: Row) -> npt.NDArray[np.float32]:
-        """(S, S, 3) control picture of a row's depth map."""
-        depth = self.depth(row)
-        if not np.isfinite(depth).any():
-            return np.zeros((*depth.shape, 3), dtype=np.float32)
-        return control_image(depth[:, ::-1] if row.flip else depth)
 
 
 class PromptPool(PicturePool):

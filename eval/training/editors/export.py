@@ -7,15 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import SUMS
-from training import steps
-from training.editors.depth import DEPTH_STAGES, DepthNet, DepthStage
+from training.editors.depth import DEPTH_STAGES, DepthNet
 from training.editors.net import TOKENS, EditorNet, scheduler
-from training.editors.recipe import STAGES, Stage, tokenizer_of, weights_of
+from training.editors.recipe import STAGES, tokenizer_of, weights_of
 
 
 def _averaged(net: Any, stage: str, out: Path) -> Any:
@@ -86,36 +84,3 @@ def _write_sums(folder: Path) -> None:
         if path.name != SUMS
     }
     (folder / SUMS).write_text(json.dumps(sums, indent=1) + "\n")
-
-
-def _facts(stage: str, out: Path, plan: Stage | DepthStage) -> dict[str, Any]:
-    """Facts of a stage's training that both kinds' cards have."""
-    stored = torch.load(out / f"{stage}.pt", weights_only=True, map_location="cpu")
-    taken = steps.STEPS_AN_EPOCH * int(stored["epoch"])
-    return {
-        "steps": taken, "planned": plan.steps, "batch": plan.batch, "minutes": float(stored["seconds"]) / 60,
-        "device": stored.get("device", "one CPU core"), "worlds": plan.worlds,
-        "state": "The stage is complete." if taken >= plan.steps else "Unfinished: a milestone, to be replaced.",
-    }  # fmt: skip
-
-
-def facts_of(stage: str, out: Path) -> dict[str, object]:
-    """Facts in an editor's card about its training."""
-    plan = STAGES[stage]
-    own, before, start = _facts(stage, out, plan), [], plan.start
-    while start is not None:
-        before.append(_facts(start, out, STAGES[start]))
-        start = STAGES[start].start
-    return {
-        **own,
-        "before": sum(facts["steps"] for facts in before),
-        "minutes": sum(facts["minutes"] for facts in [own, *before]),
-        "parts": plan.parts,
-        "large": plan.size * 2 if plan.large else 0,
-    }
-
-
-def depth_facts_of(stage: str, out: Path) -> dict[str, object]:
-    """Facts in the card of an editor of depth maps about its training."""
-    plan = DEPTH_STAGES[stage]
-    return _facts(stage, out, plan) | {"start": plan.start}

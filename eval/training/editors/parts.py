@@ -473,8 +473,7 @@ def assess(
     ] = True,
 ) -> None:
     """Measure the editor as far as it has come, on worlds that it has never seen (15 minutes)."""
-    from training.assess.card_sections import Kept, percent
-    from training.assess.part_answers import Cases, part_figures
+    from training.assess.part_answers import Cases, Kept, part_figures
 
     torch.set_num_threads(1)
     table = recolors.load(out / "data", "test", worlds)
@@ -482,7 +481,7 @@ def assess(
     pool = PartsPool(table, Tokenizer.from_file(str(START / "tokenizer" / "tokenizer.json")))
     name = f"assessed-{worlds}-{step:05d}" + "-last" * (not averaged)
     for one in part_figures(editor, Cases(table, pool), kept=Kept(out / f"{name}.json")):
-        print(f"| {one.what} | {percent(one)} | {one.count} |", flush=True)
+        print(f"| {one.what} | {one} | {one.count} |", flush=True)
 
 
 def editor_of(out: Path, averaged: bool) -> tuple[InstructPix2Pix, int]:

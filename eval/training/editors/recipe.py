@@ -6,7 +6,6 @@ The network is in :mod:`training.editors.net`. Its stages can be stopped, gone o
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -99,14 +98,6 @@ class Stage:
     composed: float = 0.0
     large: float = 0.0
 
-    def network(self, vocabulary: int) -> torch.nn.Module:
-        """The network before its training."""
-        return EditorNet(vocabulary, self.size, draws=self.draws)
-
-    def constants(self) -> dict[str, Any]:
-        """Constants that the network alone depends on, by name."""
-        return {}
-
 
 STAGES = {
     "plain": Stage(64, 11_500, 1.5e-3, 1800, parts=1190, draws=False, large=0.2, seed=11),
@@ -150,7 +141,7 @@ def constants() -> dict[str, Any]:
 
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
-    of_stages = constants() | steps.constants() | stage.constants()
+    of_stages = constants() | steps.constants()
     names = ("SENTENCES", "POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT", "HALF_PLANES")
     of_stages |= {key: getattr(editor_pool, key) for key in names}
     if stage.draws:
@@ -187,8 +178,7 @@ def train_stage(
     torch.manual_seed(stage.seed)
     tokenizer = tokenizer_of(out)
     pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
-    net: Any = stage.network(tokenizer.get_vocab_size())
-    spent = 0.0
+    net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
     if stage.start is not None:
         weights = weights_of(out, stage.start)
         begins = stage.draws and not any(k.startswith("unet.draw.") for k in weights)
@@ -196,16 +186,13 @@ def train_stage(
             weights |= {k: v for k, v in net.state_dict().items() if k.startswith("unet.draw.")}
         net.load_state_dict(weights)
         if begins and not (out / f"{name}.pt").exists():
-            start = time.perf_counter()
             editor_draws.teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
-            spent = time.perf_counter() - start
     net.to(device)
     alphas = scheduler(stage.shift).alphas_cumprod.to(device)
     empty = tokens_of(tokenizer, [""])[0].to(device)
     checkpoint = out / f"{name}.pt"
-    train_steps(
-        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device, spent
-    )  # fmt: skip
+    tasks = tasks_of(stage, pool, net, alphas, empty)
+    train_steps(net, stage, tasks, checkpoint, recipe_of(name, stage), device)
     return checkpoint
 
 

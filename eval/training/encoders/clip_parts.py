@@ -319,9 +319,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return dict(zip(names, sums / STEPS, strict=True))
 
     checkpoint = out / "clip-parts.pt"
-    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, recipe(), steps=STEPS).train(
-        epoch
-    )
+    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, recipe()).train(epoch)
     return checkpoint
 
 

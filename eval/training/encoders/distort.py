@@ -106,37 +106,16 @@ def _cast(image: Image, strength: float, rng: np.random.Generator) -> Image:
     return image + (amount * way / np.linalg.norm(way) * np.sqrt(3)).astype(np.float32)
 
 
-def _pixels(image: Image, strength: float, rng: np.random.Generator) -> Image:
-    size = _between(strength, (1, 1.5, 2.2, 3.5, 6, 10))
-    h, w = image.shape[:2]
-    small = cv2.resize(
-        image, (max(1, round(w / size)), max(1, round(h / size))), interpolation=cv2.INTER_AREA
-    )
-    return cv2.resize(small, (w, h), interpolation=cv2.INTER_NEAREST)
-
-
-def _speckle(image: Image, strength: float, rng: np.random.Generator) -> Image:
-    share = _between(strength, (0, 0.004, 0.015, 0.05, 0.13, 0.3))
-    dice = rng.uniform(size=image.shape[:2])
-    out = image.copy()
-    out[dice < share / 2] = 0
-    out[dice > 1 - share / 2] = 1
-    return out
-
-
 KINDS: dict[str, tuple[Apply, float]] = {
     "shift": (_shift, 1.9), "turn": (_turn, 1.9), "blur": (_blur, 5.0), "motion": (_motion, 5.0), "noise": (_noise, 5.0),
     "jpeg": (_jpeg, 5.0), "brightness": (_brightness, 5.0), "contrast": (_contrast, 5.0), "saturation": (_saturation, 2.9),
-    "cast": (_cast, 5.0), "pixels": (_pixels, 5.0), "speckle": (_speckle, 5.0),
+    "cast": (_cast, 5.0),
 }  # fmt: skip
 """Every kind: how it is done, and the greatest strength it reaches (a shift alone never ruins a
 picture).
 """
 
-HELD_OUT_KINDS = ("pixels", "speckle")
-"""Never seen in training."""
-
-TRAIN_KINDS = tuple(kind for kind in KINDS if kind not in HELD_OUT_KINDS)
+TRAIN_KINDS = tuple(KINDS)
 
 
 def distorted(image: Image, kind: str, strength: float, seed: int) -> Image:

@@ -79,13 +79,11 @@ class Part:
 
     Attributes:
         views: for each view of each world, the rows of its looks.
-        held_out: rows that are not trained on.
         times: how often an epoch shows it.
     """
 
     pictures: Pictures
     views: list[Ints]
-    held_out: Ints
     times: int = 1
 
 
@@ -110,7 +108,7 @@ def pictures_of(data: Path) -> list[Part]:
         order = np.flatnonzero(~held_out)
         order = order[np.argsort(keys[order], kind="stable")]
         views = list(np.split(order, np.flatnonzero(np.diff(keys[order])) + 1))
-        parts.append(Part(pictures, views, np.flatnonzero(held_out), times))
+        parts.append(Part(pictures, views, times))
     return parts
 
 
@@ -162,7 +160,7 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
                 loss = heads(pool.features(vision(images)[-1]), attributes)
             descend(optimizer, vision, loss)
             total += float(loss.detach())
-        return {"heads": total / each, **_held_out_accuracy(sets, model, heads)}
+        return {"heads": total / each}
 
     checkpoint = out / "clip-small-naming.pt"
     state = {"vision": vision, "norm": pool.norm, "heads": heads, "optimizer": optimizer}
@@ -173,25 +171,3 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
 def recipe() -> dict[str, Any]:
     """Settings and data that a checkpoint depends on."""
     return settings(globals(), "train", "train-rendered", "train-moved", "train-shapes")
-
-
-@torch.no_grad()
-def _held_out_accuracy(sets: list[Part], model: ClipSmall, heads: Heads) -> dict[str, float]:
-    """Shares of things and colours named right in the held-out worlds."""
-    model.eval()
-    right: dict[str, list[npt.NDArray[np.bool_]]] = {"things": [], "colours": []}
-    for part in sets:
-        for rows in np.array_split(part.held_out, max(1, len(part.held_out) // 100)):
-            if not len(rows):
-                continue
-            x = torch.from_numpy(part.pictures.images[rows]).permute(0, 3, 1, 2).float().div(255)
-            x = functional.interpolate(x, (model.size, model.size), mode="bilinear", antialias=True)
-            with torch.autocast("cpu", torch.bfloat16):
-                scores = heads.scores(
-                    model.pool.features(model.vision(x.to(memory_format=torch.channels_last))[-1])
-                )
-            attributes = part.pictures.attributes[rows]
-            right["things"].append(scores[0].argmax(1).numpy() == attributes[:, 0])
-            colored = np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
-            right["colours"].append((scores[2].argmax(1).numpy() == attributes[:, 2])[colored])
-    return {f"{what} named": float(np.concatenate(v).mean()) for what, v in right.items() if v}

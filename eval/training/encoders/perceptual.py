@@ -28,7 +28,6 @@ BATCH = 16
 SIZE = 64
 PEAK = 2e-3
 
-HELD_OUT_PHOTOS = ("chelsea.png", "rocket.jpg", "gravel.png", "coins.png")
 TRAIN_PHOTOS = (
     "astronaut.png", "coffee.png", "camera.png", "brick.png", "grass.png", "motorcycle_left.png", "moon.png", "ihc.png",
     "hubble_deep_field.jpg", "retina.jpg", "page.png", "text.png",

@@ -33,7 +33,7 @@ class Split:
         first: seed of the first world; the seeds of splits do not meet.
         worlds: how many.
         shard: worlds in a file.
-        pairs: colours of the objects: "seen" in training, "new", or "any".
+        pairs: colours of the objects: "seen" in training, or "any".
         new_shapes: whether the shapes are ones that training never sees.
         own_shapes: whether every world has a shape of its own, which training may see; else worlds
             share :data:`training.worlds.draw.TRAIN_SHAPES` of each thing.
@@ -61,13 +61,8 @@ SPLITS = {
     "train-moved": Split(6_000_000, 2000, moved=True),
     "train-shapes": Split(9_000_000, 4000, own_shapes=True, moved=True),
     "train-rendered": Split(1_000_000, 1000, path_traced=True),
-    "test": Split(2_000_000, 400, pairs="any", new_shapes=True),
-    "test-new-pairs": Split(3_000_000, 200, pairs="new", new_shapes=True),
-    "test-bare": Split(7_000_000, 200, pairs="any", new_shapes=True, bare=True),
-    "test-moved": Split(8_000_000, 200, pairs="any", new_shapes=True, moved=True),
-    "test-rendered": Split(4_000_000, 200, pairs="any", new_shapes=True, path_traced=True),
 }
-"""Everything that the recipes train and are measured on."""
+"""Everything that the recipes train on."""
 
 SPP = 16
 TEXELS = 512

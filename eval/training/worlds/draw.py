@@ -183,16 +183,13 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
     """A random look for an object.
 
     Args:
-        pairs: "seen" (colours shown in training), "new" (held-out ones; always a coloured finish of
-            one colour) or "any".
+        pairs: "seen" (colours shown in training) or "any".
     """
     weights = np.array([6, 3, 1.2, 1.2, 1.2, 1.4, 1.2, 1.2, 1.6, 1.6])
     while True:
         finish = int(rng.choice(len(FINISHES), p=weights / weights.sum()))
         color, second = int(rng.integers(len(COLORS))), int(rng.integers(len(COLORS)))
         kind = FINISHES[finish]
-        if pairs == "new" and kind not in ("plain", "shiny"):
-            continue
         if kind in TWO_COLORED and (
             color == second
             or {COLORS[color], COLORS[second]} <= {"black", "brown", "grey", "purple"}
@@ -211,7 +208,7 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
             continue
         used = [color, second] if kind in TWO_COLORED else [color] if kind in COLORED else []
         unseen = any(held_out(thing, c) for c in used)
-        if (pairs == "seen" and unseen) or (pairs == "new" and not unseen):
+        if pairs == "seen" and unseen:
             continue
         return Look(
             finish, color if kind in COLORED else -1, second if kind in TWO_COLORED else -1,

@@ -56,7 +56,6 @@ class PartSplit:
 
 PART_SPLITS = {
     "parts-train": PartSplit(14_000_000, 73 * SHARD),
-    "parts-test": PartSplit(15_000_000, 6 * SHARD, test=True),
 }
 
 

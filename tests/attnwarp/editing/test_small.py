@@ -1,5 +1,6 @@
 """The bundled editors as they ship: sizes, cards, and diffusers' own pipeline on the same folder."""
 
+import copy
 import json
 import re
 import shutil
@@ -11,10 +12,10 @@ import pytest
 import torch
 from diffusers import StableDiffusionControlNetPipeline, StableDiffusionInstructPix2PixPipeline
 
-import attnwarp.editing.latents
 import attnwarp.editing.small_unet  # noqa: F401  diffusers imports no module that a folder names
 from attnwarp.editing.editor import edit
 from attnwarp.editing.editors.controlnet import control_image
+from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import (
     DEPTH_GUIDANCE,
     IMAGE_GUIDANCE,
@@ -222,3 +223,40 @@ def test_an_open_instruction_hears_the_noise_inside_the_mask_alone():
 def test_an_editor_without_its_draw_is_an_option():
     assert load_editor("small-plain", draws=False).unet.draw is None
     assert load_editor("small-plain").unet.draw is not None
+
+
+def test_latents_are_an_orthonormal_transform_and_lose_nothing():
+    basis = haar_basis().reshape(48, 48)
+    assert torch.allclose(basis @ basis.T, torch.eye(48, dtype=torch.float64), rtol=0, atol=1e-12)
+    coder = HaarLatents()
+    x = 2 * torch.rand((2, 3, 20, 32), generator=torch.Generator().manual_seed(0)) - 1
+    latents = coder.encode(x).latents
+    assert latents.shape == (2, 48, 5, 8)
+    assert torch.allclose(coder.decode(latents).sample, x, rtol=0, atol=1e-5)
+    even = coder.encode(torch.full((1, 3, 4, 4), 0.5)).latents[0, :, 0, 0]
+    # Grey: sqrt(3) in luminance, 4 for the sum over 16 px of amplitude 1 / 4, half by the gain.
+    assert even[0] == pytest.approx(0.5 * 3**0.5 * 4 * 0.5)
+    assert torch.allclose(even[1:], torch.zeros(47), atol=1e-6)
+    with pytest.raises(ValueError, match=r"x: got shape \(1, 3, 5, 8\)"):
+        coder.encode(torch.zeros(1, 3, 5, 8))
+
+
+def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text():
+    net = copy.deepcopy(load_editor("small-plain").unet).double()
+    generator = torch.Generator().manual_seed(0)
+    sample = torch.randn((2, 96, 8, 12), generator=generator).double()
+    text = torch.randn((2, 5, 128), generator=generator).double()
+    with torch.no_grad():
+        result = net(sample, 885, encoder_hidden_states=text).sample
+        # The mean of 96 cells has a standard deviation of 1 / sqrt(96).
+        mean = sample[:, :48].flatten(2).sum(dim=2) / 96**0.5
+        # Half of the way from where the answer is settled to where it is open.
+        drawn = 0.5 * net.draw(torch.cat([mean, text[:, 4]], dim=1))
+        draw, net.draw = net.draw, None
+        expected = net(sample, 885, encoder_hidden_states=text + drawn[:, None]).sample
+        assert torch.allclose(result, expected, rtol=0, atol=1e-10)
+        assert not torch.allclose(result, net(sample, 885, text).sample, rtol=0, atol=1e-4)
+        net.draw = draw
+        late = net(sample, torch.tensor([850, 500]), text).sample
+        net.draw = None
+        assert torch.equal(late, net(sample, torch.tensor([850, 500]), text).sample)
