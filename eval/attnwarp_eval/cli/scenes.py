@@ -144,6 +144,14 @@ def draw(
         Path | None,
         option("Put the meshes (GLB, PLY) of this folder on the ground.", "FOLDER"),
     ] = None,
+    shapes: Annotated[
+        bool,
+        option(
+            "Give the scenes edits that add, remove, replace, move and enlarge things.",
+            None,
+            "--shapes",
+        ),
+    ] = False,
 ) -> None:
     """Draw scenes that no one made by hand, with cameras, edits and bounces.
 
@@ -163,7 +171,11 @@ def draw(
                 fixed[name] = float(value)
             except ValueError:
                 raise InputError(f"--axis: got {text!r}, expected such as occlusion=0.9") from None
-        what = {"drawn": count} if meshes is None else {"meshes": str(meshes), "n": count}
+        what: dict[str, object] = {"drawn": count}
+        if meshes is not None:
+            what = {"meshes": str(meshes), "n": count}
+        if shapes:
+            what["shapes"] = True
         wanted = population({**what, "seed": seed, "axes": fixed})
         with reporter(title="drawing") as report:
             for k, scene in enumerate(wanted.scenes()):

@@ -103,6 +103,7 @@ class DrawnScenes(_Scenes):
         generator: number of the generator; only 1 exists.
         seed: two seeds share no scene.
         axes: fixed positions on axes of difficulty; the others are drawn.
+        shapes: whether the scenes' edits change shapes.
 
     Example:
         >>> population = DrawnScenes(drawn=2, seed=7, axes={"things": 3})
@@ -113,6 +114,7 @@ class DrawnScenes(_Scenes):
     """
 
     drawn: Count
+    shapes: bool = False
     word: ClassVar[str] = "drawn"
     _number: ClassVar[str] = "drawn"
 
@@ -121,7 +123,7 @@ class DrawnScenes(_Scenes):
 
     def scene(self, number: int) -> Drawn:
         """Draw one scene."""
-        return draw(number, self.seed, self.axes)
+        return draw(number, self.seed, self.axes, self.shapes)
 
 
 class MeshScenes(_Scenes):

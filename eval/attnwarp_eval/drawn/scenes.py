@@ -31,6 +31,7 @@ from attnwarp_eval.drawn.draft import (
     unseen_colors,
 )
 from attnwarp_eval.drawn.objects import body, plain_numbers
+from attnwarp_eval.drawn.shapes import shape_edits
 from attnwarp_eval.drawn.worlds import (
     COLORS,
     FINISHES,
@@ -77,12 +78,15 @@ class Drawn:
     files: Mapping[str, Path] = field(default_factory=dict)
 
 
-def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Drawn:
+def draw(
+    number: int, seed: int, axes: Mapping[str, float] | None = None, shapes: bool = False
+) -> Drawn:
     """Draw the scene of a number and a seed.
 
     Args:
         number: number of the scene, from 0.
         axes: fixed positions on axes; the others are drawn.
+        shapes: True gives the scene edits that change shapes, in place of its others.
 
     Example:
         >>> scene = draw(3, seed=7, axes={"things": 4})
@@ -91,14 +95,16 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
         >>> draw(3, seed=7, axes={"things": 4}).spec == scene.spec
         True
     """
-    return SceneDraft(number, seed, axes or {}).finished()
+    return SceneDraft(number, seed, axes or {}).finished(shapes)
 
 
 class SceneDraft(Draft):
     """A scene being drawn, step by step."""
 
-    def finished(self) -> Drawn:
-        """Draw everything in turn and return the scene."""
+    def finished(self, shapes: bool = False) -> Drawn:
+        """Draw everything in turn and return the scene, with edits that change shapes or with
+        others.
+        """
         self.begin()
         self.choose_things()
         self._place_things()
@@ -122,8 +128,8 @@ class SceneDraft(Draft):
         }
         if self.fog is not None:
             data["medium"] = self.fog
-        data["edits"] = asked.edits(self)
         data = plain_numbers(data)
+        data["edits"] = plain_numbers(shape_edits(self, data) if shapes else asked.edits(self))
         with_bounces(data)
         spec = SceneSpec.model_validate(data)
         return Drawn(spec, data, self.axes, tuple(self.things), groups, self.files)

@@ -63,8 +63,7 @@ def kept_objects(before: Scene, after: Scene) -> set[str]:
     return {
         name
         for name in first.keys() & second.keys()
-        if len(first[name]) == len(second[name])
-        and all(map(_same, first[name], second[name]))
+        if len(first[name]) == len(second[name]) and all(map(_same, first[name], second[name]))
     }
 
 

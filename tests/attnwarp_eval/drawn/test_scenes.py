@@ -40,6 +40,32 @@ def test_generator_1_draws_what_it_always_drew():
     assert _digest(texts).startswith(OF_GENERATOR_1)
 
 
+def test_edits_that_change_shapes_do_what_they_say_to_the_bounds_of_a_thing():
+    number = 1
+    drawn = draw(number, 540, {"things": 3}, shapes=True)
+    assert drawn.data["objects"] == draw(number, 540, {"things": 3}).data["objects"]
+    scene = Scene(drawn.spec)
+
+    def bounds(of, names):
+        own = [s.bounds() for s in of.shapes() if of.object_names[s.object_id] in names]
+        return np.array([np.min(own, axis=0)[0], np.max(own, axis=0)[1]])
+
+    for k, thing in enumerate(drawn.things):
+        low, high = bounds(scene, thing.names)
+        radius, foot = (high - low)[:2].max() / 2, np.array([*(low + high)[:2] / 2, low[2]])
+        left = bounds(scene.edited(f"moved-{k}", "left"), thing.names)
+        # Cells of a mesh are rounded, positions to a tenth of a millimetre.
+        assert np.allclose(left, [low - [radius, 0, 0], high - [radius, 0, 0]], atol=1e-3)
+        grown = bounds(scene.edited(f"grown-{k}"), thing.names)
+        assert np.allclose(grown, foot + 1.2 * ([low, high] - foot), atol=1e-3)
+        gone = scene.edited(f"removed-{k}").object_names
+        assert set(scene.object_names) - set(gone) == set(thing.names)
+        for answer in scene.edit(f"added-{k}").answers:
+            edited = scene.edited(f"added-{k}", answer.name)
+            hat = bounds(edited, [f"on_{k}"])
+            assert hat[1, 2] > high[2] > hat[0, 2] - 1e-3  # it stands out above, and touches
+
+
 def test_two_seeds_share_no_scene_and_no_shape():
     first, second = ([draw(k, seed) for k in range(8)] for seed in (7, 8))
     shapes = [[one.instance for scene in side for one in scene.things] for side in (first, second)]
