@@ -167,13 +167,15 @@ def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
 def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]:
     """Sentences on seconds: of the best variant, and of the pictures' variants."""
     own = report_of(asked.columns[asked.decides].probe)
-    taken = _in_turn(results, asked)
+    timed, taken = timed_in_turn(results, own.stage), _in_turn(results, asked)
     cheapest = min(taken, key=lambda name: taken[name], default="")
     if leaders and cheapest != leaders[0] in taken and taken[cheapest] > 0:
         ratio = taken[leaders[0]] / taken[cheapest]
+        count = timed.scenes if timed else 0  # seconds may be of fewer scenes than figures
+        few = f", timed on {count} of the scenes" * (count < len(results.study.scenes))
         yield (
             f"It takes {number(1000 * taken[leaders[0]], 2)} ms {own.cost_of}, {number(ratio, 2)}"
-            f" times as long as `{cheapest}`."
+            f" times as long as `{cheapest}`{few}."
         )
     for shown in asked.pictures:
         other = report_of(shown.probe)

@@ -45,7 +45,8 @@ class Judged:
     Attributes:
         comparison: its comparison with a word; None if its study has no raw results, or lacks a
             side.
-        time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
+        time: ratio of the last side's seconds to the first one's, taken in turn, and the number of
+            scenes that were timed; a dash without.
         by_answers: description of the difference for edits with several right answers and with one,
             if the study has both.
         context: the claim's sentence on other variants, filled in.
@@ -143,8 +144,9 @@ def _time(results: Results, one: Comparison) -> str:
     both = [turn for turn in timed.turns if names <= set(turn.names)] if timed else []
     if timed is None or not both or len(names) < 2:
         return "–"
-    first, second = (Timed(both, timed.stage).rounds(name) for name in (one.a, one.b))
-    return ratio_text(time_ratio(second, first))
+    own = Timed(both, timed.stage)
+    first, second = (own.rounds(name) for name in (one.a, one.b))
+    return f"{ratio_text(time_ratio(second, first))}, {own.scenes} scene{'s' * (own.scenes != 1)}"
 
 
 def table(claims: list[Judged], beside: Path) -> Table:

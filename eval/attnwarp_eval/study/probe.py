@@ -48,6 +48,7 @@ class InTurn:
         names: names of the contestants; the first is the baseline.
         seconds: stage -> contestant -> round; the baseline's second run comes last.
         of: description of each contestant's task.
+        scene: name of the scene.
     """
 
     names: tuple[str, ...]
@@ -55,6 +56,7 @@ class InTurn:
     rounds: int
     threads: int
     of: str
+    scene: str = ""
 
 
 @dataclass

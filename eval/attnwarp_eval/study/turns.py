@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,11 @@ class Timed:
         return list(dict.fromkeys(name for turn in self.turns for name in turn.names))
 
     @property
+    def scenes(self) -> int:
+        """Number of scenes that were timed."""
+        return len({turn.scene for turn in self.turns})
+
+    @property
     def base(self) -> float:
         """Median seconds of the baseline over cells and rounds."""
         return float(np.median(np.concatenate(self.rounds(self.baseline))))
@@ -78,7 +83,7 @@ class Timed:
 def timed_in_turn(results: Results, stage: str) -> Timed | None:
     """The seconds of a stage that cells of a run took in turn; None if none did."""
     turns = [
-        turn
+        replace(turn, scene=cell.scene)
         for cell in results.cells
         if cell.record is not None
         and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None

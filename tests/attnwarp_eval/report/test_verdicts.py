@@ -163,7 +163,7 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     row = dict(zip(whole.columns, cells, strict=True))
     assert row["verdict"] == "holds" and row["scenes"] == "8"
     assert row["difference"].startswith(f"× {np.exp(np.log(factors).mean()):.2f} (")
-    assert row["time"] == "2.00 [2.00, 2.00]"
+    assert row["time"] == "2.00 [2.00, 2.00], 2 scenes"
     assert row["report"] == "[suite](reports/suite/report.md)"
     mean = 0.1 * factors.mean()
     assert row["measured"] == f"{mean:.2f} px of a 64 grid against 0.10 px of a 64 grid"

@@ -155,7 +155,7 @@ class Timing(Probe[Rounds]):
         of = (
             f"the edit {spec['edit']['name']} of {cell.scene}"
             if "edit" in spec
-            else f"view {spec['views'][0]} of each scene"
+            else f"view {spec['views'][0]} of {cell.scene}"
         )
         return InTurn(cell.variants, record.extra.seconds, spec["rounds"], record.cost.threads, of)
 
