@@ -124,7 +124,7 @@ class Workdir:
                 f"{self.path}: holds {self.what} made by an older version; run it again in another"
                 " folder"
             )
-        differing = _differences(stored if whole else _part(stored, known), known)
+        differing = differences(stored if whole else _part(stored, known), known)
         if differing:
             raise InputError(
                 f"{self.path}: holds {self.what} of other {'; '.join(differing[:3])}"
@@ -365,13 +365,13 @@ def _part(stored: Any, known: Any) -> Any:
     return {key: _part(stored.get(key), value) for key, value in known.items()}
 
 
-def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
+def differences(stored: Any, now: Any, name: str = "") -> list[str]:
     """List differences between two JSON values, by the path of the key."""
     if isinstance(stored, dict) and isinstance(now, dict):
         return [
             line
             for key in {**stored, **now}
-            for line in _differences(stored.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+            for line in differences(stored.get(key), now.get(key), f"{name}.{key}".lstrip("."))
         ]
     if stored == now:
         return []

@@ -81,6 +81,21 @@ def edit(
         Path | None,
         of_method("Take this picture, edited elsewhere, as the source view's edit.", "FILE"),
     ] = None,
+    preview: Annotated[
+        bool,
+        of_method(
+            "Edit the source view alone, by four seeds from --seed on, and write a page of these"
+            " answers, FOLDER/preview/index.html.",
+            None,
+            "--preview",
+        ),
+    ] = False,
+    answer: Annotated[
+        int | None,
+        of_method(
+            "Go on from this answer of --preview, by its number, which is its seed.", "N", min=0
+        ),
+    ] = None,
     stages: Annotated[
         int | None,
         of_method("Edit and tune in so many stages (default of extended: 3).", "N", min=1),
@@ -224,6 +239,7 @@ def edit(
             view_of,
         )
         from attnwarp.command.marks import Marks
+        from attnwarp.command.preview import Preview
         from attnwarp.fit import read_exposures
         from attnwarp.io.file import existing_file
         from attnwarp.methods.change import say_change
@@ -232,7 +248,15 @@ def edit(
         check.one_of(method, list(methods.METHODS), "--method")
         given = {"source_picture": source_picture, "store": store}
         own: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
-        used = [*own, *["each_view_alone"] * alone]
+        asked_for = {"answer": answer is not None, "preview": preview}
+        answers = [name for name, wanted in asked_for.items() if wanted]
+        if len([*answers, *["source_picture"] * (source_picture is not None)]) > 1:
+            other = "--source-picture" if source_picture is not None else "--preview"
+            raise ValueError(
+                f"--{answers[0]}: got {other} too, expected one of the two: --preview shows edits"
+                " of the source, --answer takes one of them, --source-picture one made elsewhere"
+            )
+        used = [*own, *answers, *["each_view_alone"] * alone]
         if used and method != "attention_warping":
             name = used[0].replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
@@ -252,7 +276,8 @@ def edit(
             k: " ".join(v) or None if isinstance(v, (list, tuple)) else v if v is None else str(v)
             for k, v in typed.items()
         }
-        check_asked(method, instruction, settings, budget, out, edit_options, asked)
+        shown = Preview(out, settings.seed, answer) if answers else None
+        check_asked(method, instruction, settings, budget, out, edit_options, asked, shown)
         origin = ""
         if scene:
             data = out / "scene"
@@ -279,8 +304,12 @@ def edit(
             fit_plan=FitPlan(kind=kind[:2]) if kind else FitPlan(),
             notes=lambda: [*notes, *warned()], origin=origin,
             exposures={} if ply is None else read_exposures(ply),
-            budget=budget, asked=asked, report=report, **own,
+            budget=budget, asked=asked, preview=shown, report=report, **own,
         )  # fmt: skip
+        if isinstance(result, list):
+            typer.echo("\n".join([*result, "to go on from one: --answer N in place of --preview"]))
+            typer.echo(page)
+            return
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         views = len(result.edited)
         carried = ""

@@ -28,8 +28,9 @@ from attnwarp.command.marks import (
     typed,
     write_marked,
 )
-from attnwarp.command.page import show_edit
+from attnwarp.command.page import EarlyPage, show_edit
 from attnwarp.command.page.turntable import check_film
+from attnwarp.command.preview import Preview
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import announced
 from attnwarp.editing.segment import Mask, check_marks, segmenter_folders
@@ -59,7 +60,9 @@ from attnwarp.methods.by_warps import SourceSettings
 from attnwarp.methods.change import say_drift, say_little
 from attnwarp.methods.features import Features
 from attnwarp.methods.pictures import Segment, check_view_aspect
+from attnwarp.methods.scene import checked_segments
 from attnwarp.methods.tuning import perceptual_net
+from attnwarp.methods.work import Work
 from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
 from attnwarp.warp import piece_around
@@ -124,9 +127,10 @@ def edit_dataset(
     notes: Callable[[], Sequence[str]] = tuple,
     origin: str = "",
     exposures: Mapping[str, npt.NDArray[np.float64]] = MappingProxyType({}),
+    preview: Preview | None = None,
     report: Reporter,
     **own: Any,
-) -> tuple[Result, Path]:
+) -> tuple[Result | list[str], Path]:
     """Fit splats if none are given, edit them, and write the page.
 
     Args:
@@ -138,10 +142,11 @@ def edit_dataset(
         origin: sentence on the origin of the inputs, for the page.
         exposures: (3, 4) change of colour of views, by their names; see
             :func:`attnwarp.fit.read_exposures`.
+        preview: answers that are shown, or one of which attention warping goes on from.
         own: additional options of the method, such as "budget".
 
     Returns:
-        Result of the edit, and the path of its page.
+        Result of the edit, or a line on each answer of a preview, and the path of the page.
 
     Raises:
         InputError: an unknown view, mask, editor or segmenter; marks that select nothing; foreign
@@ -177,9 +182,31 @@ def edit_dataset(
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
     torch.set_num_threads(options.threads or core_count())
     splats = splats.to(device=device)
-    compile_kernels(splats.kind, report, device)
-    if line := say_without_surface(without_surface(splats, views)):
-        report.log(line)
+    line = ""
+    if preview is None or preview.answer is not None:
+        compile_kernels(splats.kind, report, device)
+        if line := say_without_surface(without_surface(splats, views)):
+            report.log(line)
+    elif options.marks.of_source or editor.guide == "depth":
+        compile_kernels(splats.kind, report, device)
+    lifted, early = segments(splats), EarlyPage(workdir_of(out), views)
+    written = early.write
+    if preview is not None:
+        work = Work(
+            splats, views, editor, instruction, settings, "auto", preview.folder, report,
+            checked_segments(lifted, views),
+        )  # fmt: skip
+        about = {"method": method, "instruction": instruction, "options": own["asked"]}
+        if preview.answer is None:
+            return preview.make(work, index, about)
+        preview.claim(work, index, about)
+        settings = settings.changed(seed=preview.answer)
+        own["recorded"], going_on = preview.recorded(), preview
+
+        def written() -> None:
+            going_on.check_source(file_stems(views.cameras)[index])
+            early.write()
+
     result = METHODS[method](
         splats,
         views.cameras,
@@ -187,14 +214,17 @@ def edit_dataset(
         editor,
         instruction,
         settings,
-        segments=segments(splats),
+        segments=lifted,
         masks=views.masks,
         exposures=views.exposures,
         tune_outside=options.tune_outside,
         folder=out,
+        written=written,
         report=report,
         **own,
     )
+    if preview is not None:
+        preview.drop_features()
     if peak := peak_memory(device):
         report.log(f"edited{peak}")
     if result.gaussians.kind == "2d":
@@ -351,11 +381,13 @@ def check_asked(
     out: Path,
     options: EditOptions,
     asked: dict[str, Any],
+    preview: Preview | None = None,
 ) -> None:
     """Refuse invalid arguments before a capture is rendered or read.
 
     Args:
         asked: further options that decide the result, by name, as typed.
+        preview: see :func:`edit_dataset`.
     """
     check_film(options.turntable)
     type_of(options.dtype, "cpu" if options.device == "auto" else str(device_of(options.device)))
@@ -364,16 +396,16 @@ def check_asked(
     known = settings.to_dict()
     if settings.size is None:  # the editor's default, known once the editor is loaded
         del known["size"]
-    workdir_of(out).check_claimed(
-        {
-            "format": FORMAT,
-            "method": method,
-            "instruction": instruction,
-            "settings": known,
-            "budget": budget.to_dict(),
-            "options": asked,
-        }
-    )
+    manifest = {
+        "format": FORMAT, "method": method, "instruction": instruction, "settings": known,
+        "options": asked,
+    }  # fmt: skip
+    if preview is not None:
+        preview.check(manifest)
+        if preview.answer is None:
+            return
+        known["seed"] = preview.answer
+    workdir_of(out).check_claimed({**manifest, "budget": budget.to_dict()})
 
 
 def check_marked(options: EditOptions, dataset: Dataset) -> None:

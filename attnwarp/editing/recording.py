@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -141,6 +141,21 @@ class Recording:
         store.mkdir(parents=True, exist_ok=True)
         return Path(tempfile.mkdtemp(prefix="recording-", dir=store))
 
+    def state(self) -> dict[str, Any]:
+        """Return the timesteps and the features, tensors in main memory: what :meth:`of_state`
+        takes.
+        """
+        keys = self._features
+        return {
+            "timesteps": [*self.timesteps],
+            "features": {key: self._loaded(key).cpu() for key in keys},
+        }
+
+    @classmethod
+    def of_state(cls, plan: RecordingPlan, state: Mapping[str, Any]) -> Recording:
+        """Make a finished recording from its plan and its :meth:`state`."""
+        return cls(plan, state["timesteps"], state["features"])
+
     @property
     def bytes(self) -> int:
         """Bytes of the features' memory or files, counting complete storages."""
@@ -170,7 +185,10 @@ class Recording:
         if layer not in self.plan.layers:
             raise ValueError(f"layer: {layer.name} was not recorded")
         check.one_of(branch, self.plan.keep, "branch")
-        value = self._features[number, layer.name, branch]
+        return self._loaded((number, layer.name, branch))
+
+    def _loaded(self, key: tuple[int, str, str]) -> Tensor:
+        value = self._features[key]
         if isinstance(value, Path):
             from safetensors.torch import load_file
 

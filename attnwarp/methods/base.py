@@ -56,7 +56,7 @@ from attnwarp.methods.scene import (
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.methods.tuning import HELD_BYTES, Order, Tuning
 from attnwarp.methods.work import Work
-from attnwarp.reporting import PACE_SECONDS, SILENT, Reporter
+from attnwarp.reporting import PACE_SECONDS, SILENT, Reporter, duration
 from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
 
 FOLDERS = ("rounds", "masks", "segments", "views", "renders/before", "renders/after")
@@ -94,6 +94,7 @@ class Options(TypedDict, total=False):
         checkpoint_seconds: time between checkpoints of tuning (30); longer if writing one is slow.
         backend: renderer name, as for :func:`attnwarp.render.render` ("auto").
         report: receiver of progress, :class:`attnwarp.reporting.Reporter`.
+        written: function that is called after the edits of views are written to the folder.
         asked: further options of the user's command, by name, for the manifest.
         load: loader of the perceptual distance, :func:`attnwarp.encoders.load_encoder`. A caching
             loader can serve several runs.
@@ -113,6 +114,7 @@ class Options(TypedDict, total=False):
     checkpoint_seconds: float
     backend: str
     report: Reporter
+    written: Callable[[], None]
     asked: dict[str, Any]
     load: Callable[..., Any]
 
@@ -348,6 +350,7 @@ class _Run:
         self.clock = CheckpointClock(options.get("checkpoint_seconds", 30.0))
         self.names = file_stems(work.views.cameras)
         self.seconds = self.folder.seconds
+        self.written = options.get("written", lambda: None)
         plan = Plan(method)
         self.rounds, self.planned = tuple(plan.rounds), iter(plan.calls)
         bound = work.segments is not None and work.settings.composite == "original"
@@ -479,6 +482,7 @@ class _Run:
         with self.seconds.part("write"):
             for view, result in zip(views, edits, strict=True):
                 self._write_edit(number, view, result)
+            self.written()
         self.seconds.write()
 
     def _write_edit(self, number: int, view: int, edit: ViewEdit) -> None:
@@ -674,14 +678,20 @@ class _Run:
     # --- progress
 
     def _tell(self, text: str, **steps: int) -> None:
-        """Report finished steps; the seconds left once both kinds of steps have shown their pace,
-        as a step of denoising may take as long as many iterations.
+        """Report finished steps, and the views that are left to edit; the seconds left once both
+        kinds of steps have shown their pace, as a step of denoising may take as long as many
+        iterations, and those of editing before.
         """
-        seconds, left = self.seconds.parts, 0.0
+        seconds, left = self.seconds.parts, dict.fromkeys(self.total, 0.0)
         for part, total in self.total.items():
             done = self.done[part] = min(self.done[part] + steps.get(part, 0), total)
             if done < total:
                 spent = seconds.get(part, 0.0) if done else 0.0
-                left += (total - done) * spent / done if spent >= PACE_SECONDS else math.nan
+                left[part] = (total - done) * spent / done if spent >= PACE_SECONDS else math.nan
+        views = sum(len(part.views) for part in self.rounds) - self.edits
+        if views and self.cut is None:
+            text += f"; {views} view{'s' * (views > 1)} to edit"
+            if math.isnan(left["tune"]) and left["edit"] > 0:
+                text += f" in {duration(left['edit'])}"
         count = sum(self.done.values())
-        self.work.report.step(count, sum(self.total.values()), text, left)
+        self.work.report.step(count, sum(self.total.values()), text, sum(left.values()))

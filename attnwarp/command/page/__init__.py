@@ -6,7 +6,7 @@ import base64
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -37,7 +37,7 @@ from attnwarp.io.names import file_stems
 from attnwarp.io.splat import RECORD
 from attnwarp.methods.base import VIEWER_PLY, edit_file
 from attnwarp.methods.change import say_change, say_drift, say_little
-from attnwarp.methods.pictures import Bytes, Mask, resized, to_bytes
+from attnwarp.methods.pictures import Bytes, Image, Mask, resized, to_bytes
 from attnwarp.methods.scene import near_of
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST, Workdir
@@ -91,16 +91,62 @@ def show_edit(
         write_film(turntable, *turns)
     parts = [page.head(notes, origin), page.scene(), page.views(), page.agreement(), page.outside()]
     parts += [page.orbit(turns), page.costs()]
+    return write_page(folder, page.manifest["instruction"], parts, viewer=_file("viewer.js"))
+
+
+def write_page(
+    folder: Workdir, instruction: str, parts: Sequence[str], *, viewer: str = ""
+) -> Path:
+    """Write ``index.html`` from parts of HTML.
+
+    Args:
+        viewer: script of the splats' viewer, if a part shows splats.
+    """
     text = Template(_file("page.html")).substitute(
-        title=escape(f"{page.manifest['instruction']} - attnwarp"),
+        title=escape(f"{instruction} - attnwarp"),
         style=_file("page.css"),
         body="\n".join(parts),
-        script=_file("viewer.js") + _file("page.js"),
+        script=viewer + _file("page.js"),
     )
     path = folder.path / PAGE
     # The name of a view may not be valid UTF-8.
     write_atomically(path, lambda stream: stream.write(text.encode("utf-8", "replace")))
     return path
+
+
+class EarlyPage:
+    """Page of an edit in progress, which a finished edit's page replaces."""
+
+    def __init__(self, folder: Workdir, views: Views) -> None:
+        self.folder, self.photographs = folder, views
+        self._figures: dict[str, str] = {}
+
+    def write(self) -> None:
+        """Write the page: each view edited so far, below its photograph."""
+        manifest = self.folder.read_json(MANIFEST)
+        planned = 0
+        files: dict[str, str] = {}
+        for number, part in enumerate(manifest["rounds"]):
+            planned += len(part["views"])
+            made = {name: edit_file(number, name) for name in part["views"]}
+            files |= {name: file for name, file in made.items() if self.folder.has(file)}
+        numbers = {name: k for k, name in enumerate(file_stems(self.photographs.cameras))}
+        for name, file in files.items():
+            if file not in self._figures:
+                edited = self.folder.read_picture(file)
+                photograph = self.photographs.picture(numbers[name])
+                before = to_bytes(resized(photograph, (edited.shape[0], edited.shape[1])))
+                self._figures[file] = captioned(
+                    name, {f"{name}, photograph": before, f"{name}, edited": edited}
+                )
+        title = f"<h1>{escape(manifest['instruction'])}</h1>"
+        said = (
+            f"<p>The edit is not finished: {len(files)} views are edited so far, {planned} edits"
+            " are planned. Reload this page for more; it shows the edited scene once the edit is"
+            " done. A stopped edit goes on by the same command.</p>"
+        )
+        row = f'<div class="row">{"".join(self._figures[file] for file in files.values())}</div>'
+        write_page(self.folder, manifest["instruction"], [title, said, row])
 
 
 class _Page:
@@ -337,10 +383,7 @@ class _Page:
             f"{share:.0%} of the edited scene's change lies outside the mask"
         )  # fmt: skip
         shown = "".join(
-            f'<figure><img alt="mask of {escape(name)}" src="{_data(lit)}">'
-            f"<figcaption>{escape(name)}</figcaption></figure>"
-            for name in self.shown[:2]
-            for lit in [self._lit(name)]
+            captioned(name, {f"mask of {name}": self._lit(name)}) for name in self.shown[:2]
         )
         return (
             f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures. It is lit below:"
@@ -351,8 +394,7 @@ class _Page:
     def _lit(self, name: str) -> Bytes:
         """Darken the photograph outside the mask."""
         mask = self.folder.read_picture(f"segments/{name}.png") / 255
-        lit: Bytes = to_bytes(self.photographs.picture(self.names.index(name)) * (0.2 + 0.8 * mask))
-        return lit
+        return lit(self.photographs.picture(self.names.index(name)), mask)
 
     def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
         """Write both scenes' renders from cameras around them."""
@@ -426,6 +468,19 @@ def _data(pixels: Bytes, quality: int = QUALITY, exact: int = EXACT) -> str:
     bgr = np.ascontiguousarray(_shrunk(pixels)[..., ::-1])
     data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
+def lit(picture: Image, share: npt.NDArray[Any]) -> Bytes:
+    """Darken a picture, (h, w, 3) in [0, 1], outside a mask in [0, 1] that broadcasts to it."""
+    return to_bytes(picture * (0.2 + 0.8 * share))
+
+
+def captioned(caption: str, pictures: Mapping[str, Bytes]) -> str:
+    """Write pictures, by what they show, above one caption."""
+    images = "".join(
+        f'<img alt="{escape(text)}" src="{_data(pixels)}">' for text, pixels in pictures.items()
+    )
+    return f"<figure>{images}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def _figure(text: str, picture: Bytes | None, id_: str = "") -> str:

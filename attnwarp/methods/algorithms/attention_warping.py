@@ -7,7 +7,7 @@ Scene Editing"; numbers in comments are line numbers of Algorithm 1.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -79,6 +79,7 @@ def attention_warping(
     source_picture: npt.NDArray[Any] | None = None,
     warps: Warps | None = None,
     store: Literal["device", "cpu", "disk"] = "cpu",
+    recorded: Mapping[str, Any] | None = None,
     **options: Unpack[Options],
 ) -> Result:
     """Edit one view of a scene, carry the edit into other views, and tune the splats on all views.
@@ -94,6 +95,8 @@ def attention_warping(
             from exact depth; replaces the warps from the splats' depth.
         store: place of the recorded features until the edit ends: the editor's "device", main
             memory ("cpu"), or the folder ("disk").
+        recorded: the source's edit and features, made before with equal arguments, as
+            :meth:`RecordedSource.state` returns them; the source is then not edited again.
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.
@@ -110,8 +113,9 @@ def attention_warping(
     """
     check.one_of(store, ("device", "cpu", "disk"), "store")
     make = partial(
-        AttentionWarping, source=source, by_hand=source_picture, warps=warps, store=store
-    )
+        AttentionWarping, source=source, by_hand=source_picture, warps=warps, store=store,
+        made=recorded,
+    )  # fmt: skip
     return run(
         "attention_warping", make, AttentionWarpingSettings,
         gaussians, cameras, images, editor, instruction, settings, **options,
@@ -182,8 +186,9 @@ class AttentionWarping(Method):
         by_hand: npt.NDArray[Any] | None,
         warps: Warps | None,
         store: str,
+        made: Mapping[str, Any] | None = None,
     ) -> None:
-        self.work, self.settings = work, settings
+        self.work, self.settings, self.made = work, settings, made
         self.names = file_stems(work.views.cameras)
         check.instance(source, Integral, "source", "a number of a view")
         if not 0 <= source < len(self.names):
@@ -237,6 +242,12 @@ class AttentionWarping(Method):
     def edit_source(self, model: Gaussians, step: Callable[[], None]) -> list[ViewEdit]:
         """Edit the source and record its features meanwhile (line 1)."""
         work, view = self.work, self.source
+        if self.made is not None:
+            for _ in range(self.settings.steps):
+                step()
+            plan = self._plan if self.features.layers else None
+            self.keep(RecordedSource.of_state(self.made, plan))
+            return [self.result(view, self.recorded.picture)]
         with (
             work.folder.seconds.part("source"),
             work.guided(self.features.source_guidance),
@@ -245,8 +256,7 @@ class AttentionWarping(Method):
             start = self.start([view], work.frozen, by_hand=True)
             tokens, recording = self.keeping(stack), None
             if self.features.layers:
-                plan = self.features.plan(self.latent_size(view))
-                recording = stack.enter_context(record(work.editor, plan))
+                recording = stack.enter_context(record(work.editor, self._plan))
             (picture,) = self.denoise(start, [None], step)
         self.keep(RecordedSource(picture, recording, tokens))
         return [self.result(view, picture)]
@@ -304,6 +314,10 @@ class AttentionWarping(Method):
         passes = self.settings.feature_range()
         network, layers = self.work.editor.network, self._attending_layers
         return stack.enter_context(kept_tokens(network, layers, self.features.stored, passes))
+
+    @property
+    def _plan(self) -> RecordingPlan:
+        return self.features.plan(self.latent_size(self.source))
 
     def _tokens_plan(self, features: RecordingPlan) -> RecordingPlan:
         branches = self.features.branches(self.features.source_guidance)
@@ -368,10 +382,9 @@ class AttentionWarping(Method):
                 " of a UNet is recorded that could attend to the source"
             )
         if self.features.layers:
-            plan = self.features.plan(size)
-            lines.append(str(plan))
+            lines.append(str(self._plan))
             if self.attends:
-                lines.append(f"for what no warp reaches, {self._tokens_plan(plan)}")
+                lines.append(f"for what no warp reaches, {self._tokens_plan(self._plan)}")
         return lines
 
     # --- the source
@@ -539,6 +552,31 @@ class RecordedSource:
     picture: Image
     recording: Recording | None
     tokens: SourceTokens | None = None
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of what is recorded."""
+        kept = () if self.tokens is None else self.tokens.by_pass.values()
+        tokens = sum(tensor.nbytes for passes in kept for tensor in passes.values())
+        return tokens + (0 if self.recording is None else self.recording.plan.bytes)
+
+    def state(self) -> dict[str, Any]:
+        """Return tensors and plain values, from which :meth:`of_state` makes it again."""
+        return {
+            "picture": torch.from_numpy(self.picture),
+            "recording": None if self.recording is None else self.recording.state(),
+            "tokens": None if self.tokens is None else self.tokens.by_pass,
+        }
+
+    @classmethod
+    def of_state(cls, state: Mapping[str, Any], plan: RecordingPlan | None) -> RecordedSource:
+        """Make it from its :meth:`state` and the plan of its recording, if anything is recorded."""
+        recording, tokens = state["recording"], state["tokens"]
+        return cls(
+            state["picture"].numpy(),
+            None if plan is None else Recording.of_state(plan, recording),
+            None if tokens is None else SourceTokens(tokens),
+        )
 
 
 @dataclass(frozen=True, eq=False)
