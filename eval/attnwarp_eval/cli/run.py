@@ -321,6 +321,16 @@ def report(
             "FOLDER|FILE",
         ),
     ] = None,
+    latex: Annotated[
+        bool,
+        option(
+            "Write every table to tables/*.tex, captioned by what was measured.", None, "--latex"
+        ),
+    ] = False,
+    csv: Annotated[
+        bool,
+        option("Write every table to tables/*.csv, its caption first, after #.", None, "--csv"),
+    ] = False,
 ) -> None:
     """Make report.md, report.html and results.jsonl again from the cells of a run.
 
@@ -332,13 +342,18 @@ def report(
     from attnwarp_eval.report.raw import PARTS, write_raw
     from attnwarp_eval.study.store import Store
 
+    tables = ("tex",) * latex + ("csv",) * csv
     with clear_errors():
         if raw is None and not (run / "study.json").exists() and any(run.glob(PARTS)):
-            for path in write_report_of_parts(run, out=out, timings=timings, long=long):
+            for path in write_report_of_parts(
+                run, out=out, timings=timings, long=long, tables=tables
+            ):
                 typer.echo(path)
             return
         store = Store(run)
-        for path in write_report(store, out=out, timings=timings, pictures=pictures, long=long):
+        for path in write_report(
+            store, out=out, timings=timings, pictures=pictures, long=long, tables=tables
+        ):
             typer.echo(path)
         results = read_results(store)
         if raw is not None:

@@ -4,11 +4,15 @@ only.
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
+from attnwarp_eval.document.model import Report
+from attnwarp_eval.document.tables import write_tables
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.report.build import build, problems
+from attnwarp_eval.report.measured import regime
 from attnwarp_eval.report.raw import read_parts
 from attnwarp_eval.report.results import lines, read_results
 from attnwarp_eval.study.results import Results
@@ -24,6 +28,7 @@ def write_report(
     timings: bool = True,
     pictures: bool = True,
     long: bool = False,
+    tables: tuple[str, ...] = (),
 ) -> list[Path]:
     """Write the report of a run's folder from its finished cells.
 
@@ -34,6 +39,7 @@ def write_report(
         pictures: False leaves out the views' pictures, for a report stored with the code or
             in a CI summary.
         long: whether report.md has the folded sections and tables of report.html.
+        tables: endings of files ("tex", "csv") that every table gets, in the folder ``tables``.
 
     Returns:
         The written files; the last is the one to open first.
@@ -58,18 +64,19 @@ def write_report(
     report = build(results, folder, timings=timings, pictures=shown)
     path = folder / "results.jsonl"
     write_atomic(path, "".join(f"{line}\n" for line in lines(results, timings)).encode())
-    return [path, *write_files(report, folder, "report", long=long)]
+    return [path, *_written(report, results, folder, long, tables)]
 
 
 def write_report_of_parts(
-    folder: Path, *, out: Path | None = None, timings: bool = True, long: bool = False
-) -> list[Path]:
+    folder: Path, *, out: Path | None = None, timings: bool = True, long: bool = False,
+    tables: tuple[str, ...] = (),
+) -> list[Path]:  # fmt: skip
     """Write the report of a folder of raw results, without the views' pictures.
 
     Args:
         folder: path of ``results*.jsonl.xz``, parts of one study.
         out: folder of the report, by default that of the raw results.
-        timings, long: as for :func:`write_report`.
+        timings, long, tables: as for :func:`write_report`.
 
     Returns:
         The written files; the last is the one to open first.
@@ -91,7 +98,15 @@ def write_report_of_parts(
     """
     results, out = read_parts(folder), out or folder
     report = build(results, out, timings=timings, pictures=False)
-    return write_files(report, out, "report", long=long)
+    return _written(report, results, out, long, tables)
+
+
+def _written(
+    report: Report, results: Results, folder: Path, long: bool, tables: tuple[str, ...]
+) -> list[Path]:
+    regime_of = functools.partial(regime, results)
+    made = write_tables(report, regime_of, folder / "tables", tables) if tables else []
+    return [*made, *write_files(report, folder, "report", long=long)]
 
 
 def _check_pictures(results: Results, store: Store) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from attnwarp_eval.document.model import Section, Table
@@ -113,6 +113,48 @@ def measured(results: Results) -> Section:
     return Section("What it was measured on", ["\n".join(text)])
 
 
+def regime(results: Results, table: Table) -> str:
+    """Sentences on what a table was measured on, for its caption where it stands alone: scenes,
+    splats, noise, editor, encoders, code and test.
+    """
+    study, records = results.study, results.all_records()
+    names = {row[0].strip("`") for row in table.rows} & study.variants.keys()
+    scenes = study.scenes_in_words
+    seeds = f"seed{'s' * (len(study.seeds) > 1)} {', '.join(map(str, study.seeds))}"
+    told = [
+        f"Study {study.name}: {scenes}; {study.size} x {study.size} px; {seeds}. {_means(results)}",
+        *_regimes(results, names),
+        *_digests(records),
+        *_revisions(records),
+    ]
+    if len(study.scenes) >= FEWEST_SCENES:
+        told.append(
+            "Verdicts: flipped signs of the scenes' differences, paired on scene and view, p-values"
+            " adjusted over a table or over the claims (Benjamini and Hochberg)."
+        )
+    return " ".join(told)
+
+
+def _digests(records: Sequence[Record[Any]]) -> Iterator[str]:
+    """Sentences on the editors and encoders, by the beginning of their SHA-256."""
+    editors = {
+        f"the ideal editor ({', '.join(f'{k} {v}' for k, v in one['ideal'].items())})"
+        if "ideal" in one
+        else f"SHA-256 {one['sha256'][:12]}"
+        for record in records
+        if (one := record.spec.get("editor"))
+    }
+    encoders = {
+        f"{kind} {one['weights_sha256'][:12]}"
+        for record in records
+        for kind, one in (record.spec.get("encoders") or {}).items()
+        if one
+    }
+    for word, found in (("Editor", editors), ("Encoder", encoders)):
+        if found:
+            yield f"{word}{'s' * (len(found) > 1)}: {', '.join(sorted(found))}."
+
+
 def _means(results: Results) -> str:
     count = len(results.study.scenes)
     if count == 1:
@@ -126,21 +168,26 @@ def _means(results: Results) -> str:
     return f"{text}, ± half of the 95 % interval (Student's t over scenes)."
 
 
-def _regimes(results: Results) -> Iterator[str]:
-    """Sentences on the splats and on the noise of edited views, by the variants of each."""
+def _regimes(results: Results, among: Collection[str] = ()) -> Iterator[str]:
+    """Sentences on the splats and on the noise of edited views, by the variants of each.
+
+    Args:
+        among: variants that are told of; all if empty.
+    """
     splats: dict[str, list[str]] = {}
     noise: dict[str, list[str]] = {}
     for cell in results.cells:
-        if cell.record is None:
+        variants = [name for name in cell.variants if not among or name in among]
+        if cell.record is None or not variants:
             continue
         spec = cell.record.spec
         if is_fitted(spec):
-            splats.setdefault("fitted to true pictures", []).extend(cell.variants)
+            splats.setdefault("fitted to true pictures", []).extend(variants)
         elif "splats" in spec:
-            splats.setdefault("sampled on the true surfaces", []).extend(cell.variants)
+            splats.setdefault("sampled on the true surfaces", []).extend(variants)
         if probe(cell.probe).edits and "noise" in spec.get("settings", {}):
             kind = NOISE.get(spec["settings"]["noise"], spec["settings"]["noise"])
-            noise.setdefault(kind, []).extend(cell.variants)
+            noise.setdefault(kind, []).extend(variants)
     for title, kinds in (("Splats", splats), ("Noise of edited views", noise)):
         named = {kind: dict.fromkeys(names) for kind, names in kinds.items()}
         most = max(named, key=lambda kind: len(named[kind]), default="")

@@ -12,6 +12,7 @@ import pytest
 import written_runs
 from scipy import stats
 
+from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
@@ -28,6 +29,7 @@ from attnwarp_eval.report.judging import (
     measured,
     outcome,
 )
+from attnwarp_eval.report.measured import regime
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
@@ -818,3 +820,31 @@ def test_figures_that_papers_report_stand_in_one_table_with_rows_and_seconds():
     (table,) = published(written_runs.results(content, cells), "editing").tables
     dashes = ["–"] * 3
     assert table.rows == [["mine", "2", "21.0 (20.0 to 22.0)", *dashes, "200", "4.00"]]
+
+
+def test_a_tables_caption_says_what_its_own_rows_were_measured_on():
+    editors = {"good": {"ideal": {"parts": 12, "colors": 4}}, "slipped": {"sha256": "e" * 64}}
+    noise = {"good": "fresh", "slipped": "shared"}
+    cells = [
+        edited(
+            name,
+            scene=scene,
+            splats={"kind": "2d"},
+            settings={"noise": noise[name]},
+            editor=editor,
+            encoders={"clip": {"weights_sha256": "c" * 64}},
+        )
+        for scene in SCENES
+        for name, editor in editors.items()
+    ]
+    run = written_runs.results(study(), cells)
+    told = regime(run, Table(["variant"], [["`good`"]]))
+    assert told == (
+        "Study hand-made: scenes one, two, three; 512 x 512 px; seed 0. Figures are means over 3"
+        " scenes of means over their views; brackets hold the lowest and the highest scene. So few"
+        " give no verdict. Splats: sampled on the true surfaces. Noise of edited views: each view's"
+        " own. Editors: SHA-256 eeeeeeeeeeee, the ideal editor (parts 12, colors 4). Encoder: clip"
+        " cccccccccccc. Revision: `aaaaaaaaaaaa`."
+    )
+    both = regime(run, Table(["variant"], [["good"], ["slipped"]]))
+    assert "Noise of edited views: each view's own; the same in all views in slipped." in both
