@@ -1,7 +1,8 @@
-"""Figures in the bullets of README.md, recomputed from the raw results that lie beside their reports."""
+"""Every figure that README.md prints of a measurement, recomputed from the raw results or the page of its report."""
 
 import json
 import lzma
+import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -20,7 +21,7 @@ SENTENCES = [
     ("fitted/undensified", SEEN, ["2DGS fit, extended"], "`extended` brings [{:.0%}]"),
     ("fitted/undensified", SEEN, ["2DGS fit", "3DGS fit, extended", "3DGS fit"], "`corrected` {:.0%} (3DGS: {:.0%} and {:.0%})"),
     ("fitted/undensified", SEEN, ["2DGS fit, each view alone"], "each view alone {:.0%}, `extended` with exact"),
-    ("fitted/undensified", SEEN, ["exact depth and mask"], "exact depth and mask {:.0%} (24 scenes"),
+    ("fitted/undensified", SEEN, ["exact depth and mask"], "depth and mask {:.0%} (24 scenes"),
     ("fitted/undensified", KEPT, ["2DGS fit, tolerant", "2DGS fit"], "mask keeps {:.0%} of what is visible there, that of `corrected` {:.0%}"),
     ("ablation", ANSWER, ["shared: corrected"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
     ("ablation", ANSWER, ["shared: each view alone"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
@@ -29,10 +30,17 @@ SENTENCES = [
 
 
 @cache
-def cells(study):
+def lines(study):
     (path,) = (ROOT / "reports" / study).glob("*.jsonl.xz")
-    raw = lzma.decompress(path.read_bytes()).decode()
-    return [one for one in map(json.loads, raw.splitlines()) if "cell" in one]
+    return [json.loads(one) for one in lzma.decompress(path.read_bytes()).decode().splitlines()]
+
+
+def cells(study):
+    return [one for one in lines(study) if "cell" in one]
+
+
+def page(path):
+    return (ROOT / "reports" / path).read_text()
 
 
 def by_scene(study, probe, metric, variant):
@@ -47,13 +55,21 @@ def by_scene(study, probe, metric, variant):
     return {scene: np.mean(values) for scene, values in scenes.items() if values}
 
 
-@pytest.mark.parametrize(("study", "figure", "variants", "sentence"), SENTENCES)
-def test_a_bullet_has_the_means_of_the_raw_results(study, figure, variants, sentence):
-    means = [np.mean([*by_scene(study, *figure, each).values()]) for each in variants]
-    assert sentence.format(*means).replace("%", " %") in README
+def means():
+    """Means of variants, and the number of scenes that they are over."""
+    for study, figure, variants, sentence in SENTENCES:
+        values = [np.mean([*by_scene(study, *figure, each).values()]) for each in variants]
+        yield sentence.format(*values).replace("%", " %")
+    assert len(by_scene("fitted/undensified", *SEEN, "2DGS fit")) == 24
+    edited = by_scene("ablation", *ANSWER, "shared: corrected")
+    every = {one["cell"]["scene"] for one in cells("ablation")}
+    yield f"over the {len(edited)} of {len(every)} scenes whose source was edited"
 
 
-def test_the_bullet_on_editors_that_move_the_picture_has_what_is_lost_of_the_gain():
+def drifts():
+    """Shares of the gain over views alone that a moved picture costs."""
+    counts = []
+
     def lost(figure, editor, shift):
         both = "attention warping", "each view alone"
         sides = [
@@ -61,21 +77,26 @@ def test_the_bullet_on_editors_that_move_the_picture_has_what_is_lost_of_the_gai
             for px in (0, shift)
             for method in both
         ]
+        common = set.intersection(*map(set, sides))
+        counts.append(len(common))
         before, alone, after, alone_after = (
-            np.mean([side[scene] for scene in set.intersection(*map(set, sides))]) for side in sides
+            np.mean([side[scene] for scene in common]) for side in sides
         )
         return 100 * (1 - (after - alone_after) / (before - alone))
 
     small, large = ([lost(SEEN, ", ideal", shift), lost(APART, "", shift)] for shift in (2, 8))
-    told = (
-        "costs attention warping [{:.0f} %](reports/drift-study/report.md) of its gain over views"
-    )
-    assert told.format(small[0]) in README
-    assert f"ideal editor, {small[1]:.0f} % with a bundled one" in README
-    assert "8 px cost {:.0f} % and {:.0f} %".format(*large) in README
+    size = lines("drift-study")[0]["study"]["size"]
+    yield f"A shift of 2 px in {size} costs attention warping [{small[0]:.0f} %]"
+    yield f"with the ideal editor, {small[1]:.0f} % with a bundled one"
+    yield "8 px cost {:.0f} % and {:.0f} %".format(*large)
+    assert counts[0] == counts[2]
+    low, high = sorted((counts[1], counts[3]))
+    yield f"({counts[0]} scenes, {low} or {high} of them with the bundled editor"
 
 
-def test_the_bullet_on_metrics_counts_the_scenes_in_which_a_blurred_set_scores_higher():
+def metrics():
+    """Figures that were audited, and scenes in which a blurred set scores higher."""
+
     def higher(flaw):
         scenes = defaultdict(list)
         for one in cells("audit"):
@@ -87,16 +108,26 @@ def test_the_bullet_on_metrics_counts_the_scenes_in_which_a_blurred_set_scores_h
                 scenes[one["cell"]["scene"]].append(blurred > right)
         return sum(map(all, scenes.values())), len(scenes)
 
-    told = "Edit PSNR scores higher than the right edit in {} of {} scenes if one view"
-    assert told.format(*higher("blur=1")) in README
-    all_blurred, scenes = higher("blur_all=2")
-    assert all_blurred == scenes and "and in all if every view is blurred by 2 px" in README
+    rows = re.findall(r"^\| ([^|]*?) \| [^|]* \| \d+: ", page("audit/report.md"), re.MULTILINE)
+    # Of one figure there are rows by exact, rendered and fitted depth.
+    figures = {
+        re.sub(r", (depth( of fitted splats)?|fitted splats|exact)$", "", row)
+        for row in rows
+        if not row.startswith("truth:")
+    }
+    one_blurred, scenes = higher("blur=1")
+    yield f"of {len(figures)} figures on {scenes} drawn scenes"
+    yield (
+        f"scores higher than the right edit in {one_blurred} of {scenes} scenes if one view is"
+        " blurred by 1 px"
+    )
+    assert higher("blur_all=2") == (scenes, scenes)
+    yield "and in all if every view is blurred by 2 px"
 
 
-def test_the_bullet_on_photographs_has_the_medians_of_the_tracks():
-    files = [
-        json.loads((ROOT / f"reports/tracks/bear-{kind}dgs.json").read_text()) for kind in "23"
-    ]
+def tracks():
+    """Medians of the tracks of neighbouring views."""
+    files = [json.loads(page(f"tracks/bear-{kind}dgs.json")) for kind in "23"]
     medians = {
         preset: [
             row["figures"]["median"]["value"]
@@ -106,18 +137,73 @@ def test_the_bullet_on_photographs_has_the_medians_of_the_tracks():
         ]
         for preset in ("paper", "corrected")
     }
-    assert "{:.2f} against {:.2f} px between neighbouring".format(*medians["paper"]) in README
-    assert "both are at {:.2f} to {:.2f} px".format(*medians["corrected"]) in README
+    yield "{:.2f} against {:.2f} px between neighbouring".format(*medians["paper"])
+    yield "both are at {:.2f} to {:.2f} px".format(*medians["corrected"])
 
 
-def test_the_bullet_on_light_has_the_median_prices_of_the_scenes_within_their_bounces():
-    scenes = json.loads((ROOT / "reports/effects/effects.json").read_text())["scenes"]
+def light():
+    """Median prices of full light within the scenes' bounces."""
+    scenes = json.loads(page("effects/effects.json"))["scenes"]
     caps = [scene["cost"].get("cap") or scene["cost"] for scene in scenes]
     same_error = median(cap.get("at_equal_error", cap.get("at_equal_noise")) for cap in caps)
     same_samples = median(cap["faster"] for cap in caps)
-    assert f"takes [{same_error:.1f} times as long](reports/effects/effects.md) to the" in README
-    told = "same error, and {:.1f} times with the same samples, in the median of {} hand-made"
-    assert told.format(same_samples, len(scenes)) in README
-    page = (ROOT / "reports/effects/effects.md").read_text()
-    for again in json.loads((ROOT / "reports/effects/coplanar.json").read_text()):
-        assert "{:+.1%} [{:+.1%}, {:+.1%}]".format(again["bias"], *again["bias_interval"]) in page
+    yield f"takes [{same_error:.1f} times as long]"
+    yield (
+        f"to the same error, and {same_samples:.1f} times with the same samples, in the median of"
+        f" {len(scenes)} hand-made scenes"
+    )
+
+
+def hard_inputs():
+    """Sweeps of hard cases, and how many of them end."""
+    told, ends = page("stability/report.md"), defaultdict(bool)
+    for row in re.findall(r"^\| \d+ \| .*$", told, re.MULTILINE):
+        _, name, *_, end, _ = row.split(" | ")
+        ends[name] |= end != "–"  # forward and backward
+    assert "Every required level holds." in told
+    assert 0.2 < np.mean([*ends.values()]) < 0.3
+    yield f"tried in [{len(ends)} sweeps]"
+
+
+def claims():
+    """Claims, those that were not measured, and those of one edit against itself."""
+    told = page("README.md")
+    rows = told[told.index("<!-- verdicts -->") : told.index("<!-- /verdicts -->")].splitlines()[3:]
+    absent = sum("not measured: " in row for row in rows)
+    same = sum("both sides are equal to the last digit" in row for row in rows)
+    yield f"Of [{len(rows)}](reports/README.md#verdicts) claims {absent} were not measured"
+    yield f"and in {same} both sides are one edit"
+
+
+def start():
+    """Seconds of the first edit."""
+    row = re.search(r"`attnwarp edit bear .*?` \| (\d+) \|", page("first-hour/report.md"))
+    assert round(int(row[1]) / 60) == 2
+    yield "in [two minutes](reports/first-hour/report.md) on two cores"
+
+
+TOPICS = (means, drifts, metrics, tracks, light, hard_inputs, claims, start)
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_the_readme_prints_what_the_reports_give(topic):
+    missing = [phrase for phrase in topic() if phrase not in README]
+    assert missing == []
+
+
+DEFINITIONS = (
+    "each of 12 *parts* of a thing in one of 4 colours", "in 25 % of cases", "In lines 1 to 3", "in line 4",
+    "on the 14 of", "two captures", "64 or 128 px", "from 2026", "rivals of 2026", "2DGS", "3DGS", "dE00",
+)  # fmt: skip
+"""Numbers that are settings: parts, answers and their chance, sizes, names."""
+
+
+def test_no_other_figure_stands_in_what_it_finds_and_what_it_cannot_do():
+    """The lines between the marks are those of the verdicts, which test_verdicts.py recomputes."""
+    text = README[README.index("## What it finds") :]
+    before, _, rest = text.partition("<!-- headlines -->")
+    text = before + rest.partition("<!-- /headlines -->")[2]
+    for phrase in [*(phrase for topic in TOPICS for phrase in topic()), *DEFINITIONS]:
+        text = text.replace(phrase, "")
+    text = re.sub(r"\]\([^)]*\)|Apache License 2\.0", "", text)
+    assert re.findall(r"[^.]*\d[^.]*", text) == []
