@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ from attnwarp.camera import Camera
 from attnwarp.render import Render
 
 Tensor = torch.Tensor
-Distortion = Literal["ordered", "l2_ndc"]
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
@@ -293,20 +292,15 @@ def normal_consistency(view: Render) -> Tensor:
     return torch.where(defined, view.alpha - agreement, 0.0).mean()
 
 
-def depth_distortion(view: Render, form: Distortion = "ordered", *, scale: float = 1.0) -> Tensor:
-    """Average over pixels the depth spread of the splats along a ray.
+def depth_distortion(view: Render, *, scale: float = 1.0) -> Tensor:
+    """Average over pixels the depth spread of the splats along a ray: 2 sum_i w_i |sum_{j<i} w_j
+    (z_i - z_j)|, j composited before i, which is sum_ij w_i w_j |z_i - z_j| (the 2DGS paper), or
+    less where splats intersect.
 
     Args:
         view: rendered view.
-        form: "ordered", 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: sum_ij w_i
-            w_j |z_i - z_j| (the 2DGS paper), or less where splats intersect. "l2_ndc", sum_{j<i}
-            w_i w_j (m_i - m_j)^2, each pair once, with depths mapped to [0, 1] (the original 2DGS
-            code).
-        scale: length in scene units by which "ordered" is divided, so that its weight does not
-            depend on the scene's unit.
-
-    Raises:
-        ValueError: the form is unknown.
+        scale: length in scene units by which it is divided, so that its weight does not depend on
+            the scene's unit.
 
     Example:
         >>> from attnwarp.render import render
@@ -314,9 +308,6 @@ def depth_distortion(view: Render, form: Distortion = "ordered", *, scale: float
         >>> depth_distortion(render(disc(), view())).item()  # one splat has no spread
         0.0
     """
-    check.one_of(form, get_args(Distortion), "form")
-    if form == "l2_ndc":
-        return view.distortion_l2_ndc.mean()
     return view.distortion_ordered.mean() / scale
 
 

@@ -113,11 +113,10 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
         camera = dataset.cameras[stems.index(path.stem)]
         view = render(splats, camera.resize(width, height), near=near)
         alpha = view.alpha.numpy()
-        forms = (view.distortion_ordered, view.distortion_l2_ndc)
         views[path.stem] = {
             "psnr": -10 * float(np.log10(error)),
             "beyond": float((alpha < OPAQUE).mean()),
-            "distortion": min(float(form.min()) for form in forms),
+            "distortion": float(view.distortion_ordered.min()),
         }
         if path.name in depths:
             behind = render(sky, camera.resize(width, height), near=near).alpha.numpy()

@@ -567,9 +567,8 @@ class _Run:
         if s.normal_weight and done >= s.normal_from:
             loss = loss + s.normal_weight * losses.normal_consistency(view)
         if s.distortion_weight and done >= s.distortion_from:
-            loss = loss + s.distortion_weight * losses.depth_distortion(
-                view, s.distortion_form, scale=self.extent
-            )
+            distortion = losses.depth_distortion(view, scale=self.extent)
+            loss = loss + s.distortion_weight * distortion
         return loss
 
     def evaluate(self) -> None:

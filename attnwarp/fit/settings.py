@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from attnwarp.gaussians import Kind
-from attnwarp.losses import Distortion
 from attnwarp.settings import Count, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
@@ -37,9 +36,8 @@ class FitSettings(Settings):
             quaternions.
         ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
-        distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
-        distortion_form: "ordered" (in units of the scene's extent) or "l2_ndc"; see
-            :func:`attnwarp.losses.depth_distortion`.
+        distortion: weight of depth distortion in units of the scene's extent, see
+            :func:`attnwarp.losses.depth_distortion`. None: 0.01 for "2d", 0 for "3d".
         normal_from, distortion_from: share of the iterations after which these losses begin (2DGS:
             7,000 and 3,000 of 30,000).
         background: colour behind the splats and behind transparent pixels of the images: "black",
@@ -104,7 +102,6 @@ class FitSettings(Settings):
     ssim: Share = 0.2
     normal: Weight | None = None
     distortion: Weight | None = None
-    distortion_form: Distortion = "ordered"
     normal_from: Share = 0.23
     distortion_from: Share = 0.1
     background: Background = "auto"

@@ -39,8 +39,7 @@ class MethodSettings(Settings):
         iterations: number of tuning iterations, one view each: in total, or per stage of attention
             warping.
         l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim multiplies
-            1 - SSIM, the weight of distortion the form "ordered" of
-            :func:`attnwarp.losses.depth_distortion`.
+            1 - SSIM, that of distortion :func:`attnwarp.losses.depth_distortion`.
         perceptual_encoder: name of the perceptual loss, for :func:`attnwarp.encoders.load_encoder`.
         color_rate: factor of the published learning rates of the colours.
         background: colour behind the splats while tuning.

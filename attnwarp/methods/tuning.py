@@ -287,6 +287,6 @@ class Tuning:
         if s.normal:
             loss = loss + s.normal * losses.normal_consistency(picture)
         if s.distortion:
-            distortion = losses.depth_distortion(picture, "ordered", scale=self.model.extent)
+            distortion = losses.depth_distortion(picture, scale=self.model.extent)
             loss = loss + s.distortion * distortion
         return loss

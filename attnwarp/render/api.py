@@ -50,8 +50,6 @@ class Render:
         distortion_ordered: (H, W) 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)| in compositing order:
             sum_ij w_i w_j |z_i - z_j| (the 2DGS paper) where depth grows along that order, less
             elsewhere, and 0 only where that sum is 0. Scene units.
-        distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
-            near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: a splat's contribution to the picture; 0 means
             invisible. A sky splat's is that without the scene before it.
         counters: amounts of work. "splats": of the model. "visible": possibly visible splats.
@@ -83,7 +81,6 @@ class Render:
     median_depth: Tensor
     normal: Tensor
     distortion_ordered: Tensor
-    distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int] = field(repr=False)
     camera: Camera = field(repr=False)
@@ -173,7 +170,6 @@ def render(
     near: float = constants.NEAR,
     antialiased: bool | None = None,
     pose: check.Array | None = None,
-    ndc: tuple[float, float] = (constants.NDC_NEAR, constants.NDC_FAR),
 ) -> Render:
     """Render Gaussian splats: colour, coverage, depth, normals, distortion; differentiable.
 
@@ -200,7 +196,6 @@ def render(
         antialiased: True compensates the opacity of 3D splats for the screen filter. Default: the
             Gaussians' setting.
         pose: (4, 4) world-to-camera transform that replaces the camera's; may require gradients.
-        ndc: near and far of ``distortion_l2_ndc``, in scene units.
 
     Returns:
         :class:`Render`, float32 from "cpu" and "gpu", float64 from "reference".
@@ -232,7 +227,6 @@ def render(
         "near": near,
         "antialiased": antialiased,
         "pose": pose,
-        "ndc": ndc,
     }
     if math.isfinite(gaussians.far):
         return _before_sky(gaussians, camera, {"backend": backend, **given})
@@ -302,7 +296,6 @@ def _prepare(
     near: float,
     antialiased: bool | None,
     pose: check.Array | None,
-    ndc: tuple[float, float],
     *,
     on_cpu: bool,
 ) -> Inputs:
@@ -326,8 +319,6 @@ def _prepare(
     check.one_of(mode, DEPTHS[kind], "depth")
     if not (np.isfinite(near) and near > 0):
         raise ValueError(f"near: got {near}, expected a positive depth in scene units")
-    if len(ndc) != 2 or not (np.isfinite(ndc).all() and 0 < ndc[0] < ndc[1]):
-        raise ValueError(f"ndc: got {ndc}, expected (near, far) with 0 < near < far")
     if antialiased and kind == "2d":
         raise ValueError(
             "antialiased: applies to kind '3d' only; 2D splats have a screen filter instead"
@@ -383,7 +374,6 @@ def _prepare(
         antialiased=kind == "3d"
         and (gaussians.antialiased if antialiased is None else bool(antialiased)),
         screen_filter=gaussians.screen_filter,
-        ndc=(float(ndc[0]), float(ndc[1])),
     )
 
 

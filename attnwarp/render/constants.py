@@ -73,11 +73,6 @@ MEDIAN_TRANSMITTANCE = 0.5
 this.
 """
 
-NDC_NEAR = 0.2
-NDC_FAR = 100.0
-"""Planes of the original 2DGS distortion, m = far / (far - near) * (1 - near / z), in scene
-units."""
-
 TILE = 16
 """Edge of a tile in pixels, as in the published renderers: 16 squares of 4 x 4 pixels, each an
 AVX-512 register.

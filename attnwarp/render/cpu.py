@@ -46,7 +46,7 @@ from attnwarp.render.threads import ranges, run_jobs, thread_count
 keep_freed_memory()
 
 MAP_READERS = {
-    "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "background"),
+    "alpha": ("depth", "distortion_ordered", "background"),
     "depth": ("depth", "distortion_ordered"),
 }
 """Outputs, and the background, whose gradients read a map held by the caller."""
@@ -69,7 +69,6 @@ class _Drawn:
 
     binned: BinnedSplats
     pictures: layout.Pictures
-    ndc_scale: float
     weight: np.ndarray  # (N,) float32
     counters: dict[str, int]
 
@@ -78,9 +77,9 @@ def _pictures(inputs: Inputs, *, with_state: bool) -> layout.Pictures:
     h, w = inputs.height, inputs.width
     color = np.empty((h, w, inputs.channels), np.float32)
     normal = np.empty((h, w, 3), np.float32)
-    alpha, depth, median, ordered, l2 = (np.empty((h, w), np.float32) for _ in range(5))
+    alpha, depth, median, ordered = (np.empty((h, w), np.float32) for _ in range(4))
     state = np.empty((len(layout.STATE), h if with_state else 0, w), np.float32)
-    return layout.Pictures(color, alpha, depth, median, normal, ordered, l2, state)
+    return layout.Pictures(color, alpha, depth, median, normal, ordered, state)
 
 
 def _workspace(channels: int) -> rasterization.Workspace:
@@ -99,8 +98,6 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
     """Run the forward pass; ``with_state`` keeps the state for a backward pass."""
     binned = BinnedSplats(inputs)
     tile_count = binned.tile_count
-    near, far = inputs.ndc
-    ndc_scale = (far * near / (far - near)) ** 2
     pictures = _pictures(inputs, with_state=with_state)
     processed, tested, composited, contributing = np.zeros((4, tile_count), np.int64)
     opaque, live = np.zeros(tile_count, np.bool_), np.ones(tile_count, np.bool_)
@@ -129,7 +126,6 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
                         lists,
                         binned.table,
                         binned.background,
-                        ndc_scale,
                         pictures,
                         progress,
                         _workspace(binned.channels),
@@ -159,7 +155,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
         "composited": int(totals[2]),
         "contributing": int(contributing.sum()),
     }
-    return _Drawn(binned, pictures, ndc_scale, weight, counters)
+    return _Drawn(binned, pictures, weight, counters)
 
 
 class _Composite(torch.autograd.Function):
@@ -309,7 +305,7 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
             )
             rasterize_backward(
                 begin, end, binned.view, binned.tiles, binned.lists, binned.table,
-                binned.background, drawn.ndc_scale, drawn.pictures, upstream, rows, space,
+                binned.background, drawn.pictures, upstream, rows, space,
             )  # fmt: skip
 
         run_jobs(work, list(itertools.pairwise(edges)))

@@ -130,8 +130,8 @@ class _Drawn:
     terms: Tensor  # (entries, TERMS)
     entries: Tensor  # (entries,) int32, splats
     bounds: Tensor  # (tiles, 2) int32
-    state: Tensor  # (3, H, W)
-    steps: Tensor  # (3, H, W) int32
+    state: Tensor  # (H, W) float32, the transmittance behind all splats
+    steps: Tensor  # (2, H, W) int32
     counters: dict[str, int]
 
     @property
@@ -147,7 +147,6 @@ def _view(inputs: Inputs) -> Any:
     pose, K = inputs.pose.detach().double().cpu(), inputs.K.double().cpu()
     rotation = pose[:3, :3]
     moved = rotation @ inputs.origin.double().cpu() + pose[:3, 3]
-    near, far = inputs.ndc
     view = layout.View()
     view.rotation, view.translation = wp.mat33d(*rotation.flatten().tolist()), wp.vec3d(*moved)
     view.fx, view.skew, view.fy = float(K[0, 0]), float(K[0, 1]), float(K[1, 1])
@@ -159,7 +158,6 @@ def _view(inputs: Inputs) -> Any:
     view.antialiased, view.harmonic = inputs.antialiased, inputs.harmonic
     view.degree = round(inputs.values.shape[1] ** 0.5) - 1 if inputs.harmonic else 0
     view.channels = inputs.channels
-    view.ndc_scale = (far * near / (far - near)) ** 2
     return view
 
 
@@ -264,9 +262,9 @@ def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
     _launch(binning.lay_out, total, device, view, doubles, tile_of, entries, total, bounds, terms)
     h, w = inputs.height, inputs.width
     color, normal = torch.empty(h, w, inputs.channels, **single), torch.empty(h, w, 3, **single)
-    alpha, depth, median, ordered, l2 = (torch.empty(h, w, **single) for _ in range(5))
-    pictures = (color, alpha, depth, median, normal, ordered, l2)
-    state, steps = torch.empty(3, h, w, **single), torch.empty(2, h, w, **whole)
+    alpha, depth, median, ordered = (torch.empty(h, w, **single) for _ in range(4))
+    pictures = (color, alpha, depth, median, normal, ordered)
+    state, steps = torch.empty(h, w, **single), torch.empty(2, h, w, **whole)
     background = inputs.background.detach().float().contiguous()
     features = splats.values[:0] if inputs.harmonic else splats.values
     sums = torch.zeros(n, dtype=torch.int64, device=device)
@@ -324,7 +322,7 @@ def _gradients(
     """Compute gradients of the tensors of ``Inputs`` from those of the outputs."""
     device, view, splats = drawn.device, drawn.view, drawn.splats
     n, channels = len(splats.means), view.channels
-    image = tuple(drawn.state.shape[1:])
+    image = tuple(drawn.state.shape)
     shapes = {"color": (*image, channels), "normal": (*image, 3), "weight": (n,)}
     given = {
         name: torch.zeros(shapes.get(name, image), dtype=torch.float32, device=device)
@@ -339,7 +337,7 @@ def _gradients(
         view, drawn.singles, drawn.features, drawn.terms, drawn.entries, drawn.bounds,
         drawn.background, maps["alpha"], maps["depth"], drawn.state, drawn.steps,
         given["color"], given["alpha"], given["depth"], given["median_depth"], given["normal"],
-        given["distortion_ordered"], given["distortion_l2_ndc"], given["weight"], total,
+        given["distortion_ordered"], given["weight"], total,
     )  # fmt: skip
     made = [torch.zeros_like(part) for part in splats.parts]
     with_pose = bool(ctx.needs_input_grad[7])

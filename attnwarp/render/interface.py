@@ -33,7 +33,6 @@ class Inputs:
     near: float
     antialiased: bool
     screen_filter: float
-    ndc: tuple[float, float]
 
     @property
     def leaves(self) -> tuple[Tensor, ...]:
@@ -57,7 +56,6 @@ class Outputs:
     median_depth: Tensor
     normal: Tensor
     distortion_ordered: Tensor
-    distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int]
 
@@ -69,7 +67,6 @@ PICTURES = (
     "median_depth",
     "normal",
     "distortion_ordered",
-    "distortion_l2_ndc",
 )
 """Names of the picture outputs."""
 

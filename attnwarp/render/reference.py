@@ -133,20 +133,20 @@ def _render(inputs: Inputs, limits: Thresholds, chunk: int) -> tuple[Outputs, Te
             indexing="ij",
         )
         parts.append(splats.composite(x.reshape(-1), y.reshape(-1)))
-    merged = [torch.cat([part[k] for part in parts]) for k in range(8)]
+    merged = [torch.cat([part[k] for part in parts]) for k in range(7)]
     shape = (inputs.height, inputs.width)
     color, normal = merged[0].reshape(*shape, -1), merged[4].reshape(*shape, 3)
-    alpha, depth, median, ordered, l2, l1 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6, 7))
+    alpha, depth, median, ordered, l1 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6))
     color = color + (1 - alpha)[..., None] * background
     weight = torch.zeros(len(means), dtype=torch.float64).index_add(
-        0, index, torch.stack([part[8] for part in parts]).sum(dim=0)
+        0, index, torch.stack([part[7] for part in parts]).sum(dim=0)
     )
     counters = {
         "splats": len(means),
         "pairs": len(means) * inputs.width * inputs.height,
-        "contributing": sum(int(part[9]) for part in parts),
+        "contributing": sum(int(part[8]) for part in parts),
     }
-    return Outputs(color, alpha, depth, median, normal, ordered, l2, weight, counters), l1
+    return Outputs(color, alpha, depth, median, normal, ordered, weight, counters), l1
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class _Splats:
 
     def composite(self, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         """Composite per pixel colour over black, alpha, depth, median, normal, distortions
-        (ordered, l2, l1); also weight per splat, contributing pairs.
+        (ordered, l1); also weight per splat, contributing pairs.
         """
         inputs, limits = self.inputs, self.limits
         rays = torch.stack(_unproject(x, y, self.K), dim=-1)
@@ -194,8 +194,6 @@ class _Splats:
             median = torch.where(covered, z.gather(1, last[:, None])[:, 0], nan)
         else:
             median = nan
-        near, far = inputs.ndc
-        m = far / (far - near) * (1 - near / z)
         gaps = _gaps(w, z)
         flat = gaps.detach().abs() <= constants.GAP_MIN * z.detach()
         ordered = 2 * (w * torch.where(flat, gaps.detach(), gaps).abs()).sum(dim=1)
@@ -204,8 +202,7 @@ class _Splats:
         by_depth = z.detach().float().argsort(dim=1, stable=True)
         sorted_w = w.gather(1, by_depth)
         l1 = 2 * (sorted_w * _gaps(sorted_w, z.gather(1, by_depth))).sum(dim=1)
-        l2 = (w * (m * m * _before(w) + _before(w * m * m) - 2 * m * _before(w * m))).sum(dim=1)
-        return color, total, depth, median, normal, ordered, l2, l1, w.sum(dim=0), drawn.sum()
+        return color, total, depth, median, normal, ordered, l1, w.sum(dim=0), drawn.sum()
 
     def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
         # Bounded from below: the slope of a square root at zero is infinite, and a disc may lie

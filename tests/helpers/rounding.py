@@ -41,7 +41,7 @@ px.
 def prepared(splats: Gaussians, camera: Camera, **options: object) -> Inputs:
     """Inputs of a backend, with the defaults of `render`."""
     given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
-    given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
+    given |= {"near": constants.NEAR}
     return api._prepare(splats, camera, **(given | options), on_cpu=True)  # type: ignore[arg-type]
 
 

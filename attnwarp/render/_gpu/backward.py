@@ -37,7 +37,7 @@ def composite_backward(
     background: wp.array(dtype=wp.float32),
     alpha: wp.array2d(dtype=wp.float32),
     depth: wp.array2d(dtype=wp.float32),
-    state: wp.array3d(dtype=wp.float32),
+    state: wp.array2d(dtype=wp.float32),
     steps: wp.array3d(dtype=wp.int32),
     d_color: wp.array3d(dtype=wp.float32),
     d_alpha: wp.array2d(dtype=wp.float32),
@@ -45,7 +45,6 @@ def composite_backward(
     d_median: wp.array2d(dtype=wp.float32),
     d_normal: wp.array3d(dtype=wp.float32),
     d_ordered: wp.array2d(dtype=wp.float32),
-    d_l2: wp.array2d(dtype=wp.float32),
     d_weight: wp.array(dtype=wp.float32),
     total: wp.array2d(dtype=wp.float64),
 ):
@@ -57,9 +56,8 @@ def composite_backward(
     here = pixel_of(view, wp.tid())
     row, column = here.row, here.column
     last, median_step = wp.int32(0), wp.int32(0)
-    T, A, mean, mean_inverse = f32(1.0), f32(1.0), f32(0.0), f32(0.0)
-    in_depth, in_l2, in_median = f32(0.0), f32(0.0), f32(0.0)
-    in_ordered = f32(0.0)
+    T, A, mean = f32(1.0), f32(1.0), f32(0.0)
+    in_depth, in_ordered, in_median = f32(0.0), f32(0.0), f32(0.0)
     in_normal, in_color = wp.vec3f(), wp.vec3f()
     behind_alpha, behind_depth = f32(0.0), f32(0.0)
     # Each splat's part with the sign of its gap.
@@ -72,13 +70,10 @@ def composite_backward(
     # Elsewhere depth is NaN, and gradients may be anything.
     if last > 0:
         median_step = steps[Plane.median, row, column]
-        T, A = f32(state[Plane.transmittance, row, column]), f32(alpha[row, column])
+        T, A = f32(state[row, column]), f32(alpha[row, column])
         mean = depth[row, column]
-        mean_inverse = state[Plane.inverse_depth, row, column]
         in_depth = d_depth[row, column] / A
-        scaled = view.ndc_scale * d_l2[row, column]
-        in_l2 = scaled * A
-        in_alpha = d_alpha[row, column] + scaled * state[Plane.variance, row, column]
+        in_alpha = d_alpha[row, column]
         for k in range(view.channels):
             in_alpha -= d_color[row, column, k] * background[k]
             if k < 3:
@@ -103,11 +98,9 @@ def composite_backward(
                 rest = f32(1.0) / (f32(1.0) - r.alpha)
                 T *= rest
                 w = r.alpha * T
-                z = depth_from(view, singles, i, r, mean, mean_inverse)
-                inverse_z = z[1] + mean_inverse
-                in_inverse = in_l2 * z[1]
+                z = depth_from(view, singles, i, r, mean)
                 # The gradient in the weight.
-                g = in_depth * z[0] + in_inverse * z[1] + d_weight[i]
+                g = in_depth * z + d_weight[i]
                 for k in range(3):
                     g += in_normal[k] * singles[i, Of.normal + k]
                     g += in_color[k] * singles[i, Of.values + k]
@@ -115,18 +108,16 @@ def composite_backward(
                     g += d_color[row, column, k] * features[i, k]
                 # In front the weights sum up to ``front``, and the gaps from there, times the
                 # weights, to ``gap``: first moments vanish about the mean.
-                w_depth = w * z[0]
+                w_depth = w * z
                 front = A - w - behind_alpha
-                gap = z[0] * front + w_depth + behind_depth
+                gap = z * front + w_depth + behind_depth
                 sign = f32(0.0)
-                if wp.abs(gap) > GAP_MIN * (z[0] + mean):
+                if wp.abs(gap) > GAP_MIN * (z + mean):
                     sign = wp.sign(gap)
-                g += in_ordered * (sign * gap + signed_depth - z[0] * signed_alpha)
+                g += in_ordered * (sign * gap + signed_depth - z * signed_alpha)
                 in_z = w * (in_depth + in_ordered * (sign * front - signed_alpha))
                 if step == median_step:
                     in_z += in_median
-                # Chain rule through 1 / z: d(1 / z) / dz = -1 / z^2.
-                in_z -= f32(2.0) * w * in_inverse * inverse_z * inverse_z
                 in_exponent = f32(0.0)
                 if r.alpha < ALPHA_MAX:
                     in_exponent = (T * g - behind_loss * rest) * r.alpha

@@ -19,13 +19,8 @@ NAN = f32(float("nan"))
 
 
 class Plane:
-    """Planes of the state saved by the forward pass."""
+    """Planes of the steps saved by the forward pass."""
 
-    # float32
-    transmittance = 0  # behind all splats
-    inverse_depth = 1  # mean of 1 / z
-    variance = 2  # of 1 / z, times alpha
-    # int32
     last = 0  # 1 + place in the tile's list of the last splat drawn; 0: none
     median = 1
 
@@ -72,8 +67,7 @@ def composite(
     median: wp.array2d(dtype=wp.float32),
     normal: wp.array3d(dtype=wp.float32),
     ordered: wp.array2d(dtype=wp.float32),
-    l2: wp.array2d(dtype=wp.float32),
-    state: wp.array3d(dtype=wp.float32),
+    state: wp.array2d(dtype=wp.float32),
     steps: wp.array3d(dtype=wp.int32),
     weight: wp.array(dtype=wp.int64),
 ):
@@ -83,8 +77,8 @@ def composite(
     """
     here = pixel_of(view, wp.tid())
     T = wp.where(here.inside, f32(1.0), f32(0.0))
-    A, depth_sum, inverse_sum, square_sum, gaps = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
-    first_depth, first_inverse, middle = f32(0.0), f32(0.0), f32(0.0)
+    A, depth_sum, gaps = f32(0.0), f32(0.0), f32(0.0)
+    first_depth, middle = f32(0.0), f32(0.0)
     n, c = wp.vec3f(), wp.vec3f()
     last, median_step, hits = wp.int32(0), wp.int32(0), wp.int32(0)
     begin, end = bounds[here.tile, 0], bounds[here.tile, 1]
@@ -103,19 +97,16 @@ def composite(
             if drawn:
                 w = r.alpha * T
                 if hits == 0:
-                    z = depth_from(view, singles, i, r, f32(0.0), f32(0.0))
-                    first_depth, first_inverse = z[0], z[1]
-                z = depth_from(view, singles, i, r, first_depth, first_inverse)
+                    first_depth = depth_from(view, singles, i, r, f32(0.0))
+                z = depth_from(view, singles, i, r, first_depth)
                 last = e - begin + 1
                 hits += 1
                 if T > MEDIAN:
-                    middle, median_step = z[0], last
-                w_depth, w_inverse = w * z[0], w * z[1]
+                    middle, median_step = z, last
+                w_depth = w * z
                 gaps += wp.abs(w_depth * A - w * depth_sum)
                 A += w
                 depth_sum += w_depth
-                inverse_sum += w_inverse
-                square_sum += w_inverse * z[1]
                 for k in range(3):
                     n[k] += w * singles[i, Of.normal + k]
                     c[k] += w * singles[i, Of.values + k]
@@ -129,7 +120,6 @@ def composite(
         return
     covered = hits > 0
     inverse = wp.where(covered, f32(1.0) / A, f32(0.0))
-    variance = wp.max(square_sum - inverse_sum * inverse_sum * inverse, f32(0.0))
     for k in range(view.channels):
         value = f32(0.0)
         if k < 3:
@@ -144,9 +134,6 @@ def composite(
     median[here.row, here.column] = wp.where(covered, first_depth + middle, NAN)
     # Pairs were counted once.
     ordered[here.row, here.column] = f32(2.0) * gaps
-    l2[here.row, here.column] = A * variance * view.ndc_scale
-    state[Plane.transmittance, here.row, here.column] = T
-    state[Plane.inverse_depth, here.row, here.column] = first_inverse + inverse_sum * inverse
-    state[Plane.variance, here.row, here.column] = variance
+    state[here.row, here.column] = T
     steps[Plane.last, here.row, here.column] = last
     steps[Plane.median, here.row, here.column] = median_step

@@ -22,13 +22,12 @@ SMALLEST = f32(1e-30)
 
 @wp.struct
 class Pair:
-    """Splat at a pixel. Depths of a 2D splat are in units of its column ``depth``, except its
+    """Splat at a pixel. The depth of a 2D splat is in units of its column ``depth``, except its
     centre's depth, which ``depth_from`` reads from the splat's row."""
 
     drawn: wp.bool
     alpha: wp.float32  # anything where not drawn
     z: wp.float32
-    inverse_z: wp.float32
     # Of 2D splats U, V and W; of 3D splats u, v and l.
     u: wp.float32
     v: wp.float32
@@ -51,8 +50,7 @@ def evaluate(
         r.u = terms[e, 0] + (singles[i, Of.u_x] * x + singles[i, Of.u_y] * y)
         r.v = terms[e, 1] + (singles[i, Of.v_x] * x + singles[i, Of.v_y] * y)
         r.w = terms[e, 2] + (singles[i, Of.w_x] * x + singles[i, Of.w_y] * y)
-        r.inverse_z = wp.min(wp.max(r.w, singles[i, Of.w_low]), singles[i, Of.w_high])
-        r.z = f32(1.0) / r.inverse_z
+        r.z = f32(1.0) / wp.min(wp.max(r.w, singles[i, Of.w_low]), singles[i, Of.w_high])
         ex, ey = x + terms[e, 3], y + terms[e, 4]
         screen = f32(2.0) * (ex * ex + ey * ey)
         if r.w <= singles[i, Of.w_most]:
@@ -65,7 +63,6 @@ def evaluate(
         r.v = terms[e, 1] + singles[i, Of.factor_yy] * y
         rho = r.u * r.u + r.v * r.v
         r.z = singles[i, Of.depth_low]
-        r.inverse_z = singles[i, Of.inverse_depth_low]
         if not view.by_center:
             r.w = terms[e, 2] + (singles[i, Of.peak_x] * x + singles[i, Of.peak_y] * y)
             r.p = terms[e, 3] + (singles[i, Of.peak_xx] * x + singles[i, Of.peak_xy] * y)
@@ -74,7 +71,6 @@ def evaluate(
             r.over = f32(1.0) / wp.max(square, SMALLEST)
             z = singles[i, Of.depth] * r.w * r.over
             r.z = wp.min(wp.max(z, singles[i, Of.depth_low]), singles[i, Of.depth_high])
-            r.inverse_z = f32(1.0) / r.z
     r.drawn = rho <= singles[i, Of.cut]
     if r.drawn:
         r.alpha = wp.min(singles[i, Of.opacity] * wp.exp(-HALF * rho), ALPHA_MAX)
@@ -83,17 +79,11 @@ def evaluate(
 
 @wp.func
 def depth_from(
-    view: View, singles: wp.array2d(dtype=wp.float32), i: wp.int32, r: Pair,
-    z0: wp.float32, inverse_z0: wp.float32,
-) -> wp.vec2f:  # fmt: skip
-    """Compute z - z0 and 1 / z - inverse_z0 of a splat."""
+    view: View, singles: wp.array2d(dtype=wp.float32), i: wp.int32, r: Pair, z0: wp.float32
+) -> wp.float32:
+    """Compute z - z0 of a splat."""
     if view.by_center:
-        return wp.vec2f(
-            singles[i, Of.depth_low] - z0, singles[i, Of.inverse_depth_low] - inverse_z0
-        )
+        return singles[i, Of.depth_low] - z0
     if view.discs:
-        return wp.vec2f(
-            fma(singles[i, Of.depth], r.z, -z0),
-            fma(singles[i, Of.inverse_depth], r.inverse_z, -inverse_z0),
-        )
-    return wp.vec2f(r.z - z0, r.inverse_z - inverse_z0)
+        return fma(singles[i, Of.depth], r.z, -z0)
+    return r.z - z0

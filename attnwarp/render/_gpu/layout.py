@@ -71,10 +71,8 @@ class Of:
     w_most = 10  # the plane is nearer than near where W is larger
     opacity = 11
     depth = 12  # of the centre
-    inverse_depth = 13
     depth_low = 14  # bounds of z at a pixel: the splat's extent, and near
     depth_high = 15
-    inverse_depth_low = 16
     normal = 17  # (3) in world axes
     values = 20  # (3) the first three channels
     is_ellipse = 23  # its outline is one
@@ -140,4 +138,3 @@ class View:
     harmonic: wp.bool  # values are spherical harmonics, else features
     degree: wp.int32  # of the harmonics
     channels: wp.int32
-    ndc_scale: wp.float32  # from variances of 1 / z to distortion_l2_ndc

@@ -167,7 +167,6 @@ def disc(
     singles[i, Of.w_x] = f32(wx)
     singles[i, Of.w_y] = f32(wy)
     singles[i, Of.w_most] = f32(c[2] / view.near)
-    singles[i, Of.inverse_depth] = f32(ONE / c[2])
     # Where it shows by its intersection, z lies between these.
     reach = spread * EXTENT
     singles[i, Of.w_high] = f32(c[2] / wp.max(c[2] - reach, view.near))
@@ -446,7 +445,6 @@ def project(
     singles[i, Of.depth] = f32(c[2])
     singles[i, Of.depth_low] = f32(low)
     singles[i, Of.depth_high] = f32(high)
-    singles[i, Of.inverse_depth_low] = f32(ONE / low)
     for k in range(3):
         singles[i, Of.normal + k] = f32(flip * q[k, axis])
     singles[i, Of.is_ellipse] = f32(1.0)

@@ -71,25 +71,22 @@ class Slots(NamedTuple):
     transmittance: int = 2  # behind the current splat
     last_step: int = 3
     median_step: int = 4
-    # Relative to the means the first moments vanish, and with them most terms.
+    # Relative to the mean the first moment vanishes, and with it most terms.
     depth: int = 5
-    inverse_depth: int = 6
-    variance: int = 7
-    alpha: int = 8
-    d_depth: int = 9
-    d_l2: int = 10
-    d_ordered: int = 11
-    d_median: int = 12
-    behind_alpha: int = 13
-    behind_depth: int = 14
+    alpha: int = 6
+    d_depth: int = 7
+    d_ordered: int = 8
+    d_median: int = 9
+    behind_alpha: int = 10
+    behind_depth: int = 11
     # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
     # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
-    behind_loss: int = 15
+    behind_loss: int = 12
     # Each splat's part with the sign of its gap; see _blame.
-    signed_alpha: int = 16
-    signed_depth: int = 17
-    d_normal: int = 18  # (3)
-    d_color: int = 21  # (channels)
+    signed_alpha: int = 13
+    signed_depth: int = 14
+    d_normal: int = 15  # (3)
+    d_color: int = 18  # (channels)
 
 
 SLOT = Slots()
@@ -197,7 +194,7 @@ def _write_ellipsoid_row(work, row, rows, line):
 
 
 @inlined
-def _select_drawn(buffer, p, background, scale):
+def _select_drawn(buffer, p, background):
     """Prepare the outputs and gradients of 16 pixels for their splats.
 
     Values are selected, not multiplied: depth is NaN and gradients are arbitrary if nothing is
@@ -206,9 +203,7 @@ def _select_drawn(buffer, p, background, scale):
     zero = f32(0.0)
     drawn = load(buffer, SLOT.last_step * PIXELS + p) > zero
     A = select(drawn, load(buffer, SLOT.alpha * PIXELS + p), f32(1.0))
-    d_l2 = load(buffer, SLOT.d_l2 * PIXELS + p) * scale
     d_alpha = load(buffer, SLOT.behind_loss * PIXELS + p)
-    d_alpha = d_alpha + d_l2 * load(buffer, SLOT.variance * PIXELS + p)
     for c in range(3):
         slot = (SLOT.d_color + c) * PIXELS + p
         d_alpha = d_alpha - load(buffer, slot) * background[c]
@@ -219,7 +214,6 @@ def _select_drawn(buffer, p, background, scale):
     store(buffer, SLOT.behind_loss * PIXELS + p, select(drawn, zero - d_alpha, zero))
     slot = SLOT.d_depth * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot) / A, zero))
-    store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
     slot = SLOT.d_ordered * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
     slot = SLOT.d_median * PIXELS + p
@@ -230,7 +224,7 @@ def _select_drawn(buffer, p, background, scale):
 
 
 @inlined
-def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
+def _load_whole_tile(buffer, tile, view, background, pictures, upstream):
     """Load outputs and gradients of a complete tile of three channels into its buffer."""
     width, plane = view.width, view.width * view.height
     state = pictures.state
@@ -241,23 +235,20 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.transmittance * PIXELS + p, state, pixel + STATE.transmittance * plane)
         copy4(buffer, SLOT.last_step * PIXELS + p, state, pixel + STATE.last_step * plane)
         copy4(buffer, SLOT.median_step * PIXELS + p, state, pixel + STATE.median_step * plane)
-        copy4(buffer, SLOT.inverse_depth * PIXELS + p, state, pixel + STATE.inverse_depth * plane)
-        copy4(buffer, SLOT.variance * PIXELS + p, state, pixel + STATE.variance * plane)
         copy4(buffer, SLOT.depth * PIXELS + p, pictures.depth, pixel)
         copy4(buffer, SLOT.alpha * PIXELS + p, pictures.alpha, pixel)
         copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, pixel)
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, pixel)
-        copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, pixel)
         copy4(buffer, SLOT.d_ordered * PIXELS + p, upstream.ordered, pixel)
         copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, pixel)
         separate4(buffer, SLOT.d_normal * PIXELS + p, PIXELS, upstream.normal, 3 * pixel)
         separate4(buffer, SLOT.d_color * PIXELS + p, PIXELS, upstream.color, 3 * pixel)
     for p in range(0, PIXELS, 16):
-        _select_drawn(buffer, p, background, scale)
+        _select_drawn(buffer, p, background)
 
 
 @inlined
-def _load_tile(buffer, tile, background, scale, pictures, upstream):
+def _load_tile(buffer, tile, background, pictures, upstream):
     """Load outputs and gradients of a tile of any size and channel count into its buffer."""
     state = pictures.state
     for r in range(tile.rows):
@@ -271,10 +262,8 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
             buffer[u64(SLOT.last_step * PIXELS) + p] = state[STATE.last_step, y, x]
             buffer[u64(SLOT.median_step * PIXELS) + p] = state[STATE.median_step, y, x]
             buffer[u64(SLOT.depth * PIXELS) + p] = pictures.depth[y, x]
-            buffer[u64(SLOT.inverse_depth * PIXELS) + p] = state[STATE.inverse_depth, y, x]
             d_depth = upstream.depth[y, x] / A
-            d_l2 = scale * upstream.l2[y, x]
-            d_alpha = upstream.alpha[y, x] + d_l2 * state[STATE.variance, y, x]
+            d_alpha = upstream.alpha[y, x]
             for c in range(background.shape[0]):
                 d_alpha -= upstream.color[y, x, u64(c)] * background[c]
                 buffer[u64((SLOT.d_color + c) * PIXELS) + p] = upstream.color[y, x, u64(c)]
@@ -282,37 +271,34 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
                 buffer[u64((SLOT.d_normal + c) * PIXELS) + p] = upstream.normal[y, x, u64(c)]
             buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
-            buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
             buffer[u64(SLOT.d_ordered * PIXELS) + p] = f32(2.0) * upstream.ordered[y, x]
             buffer[u64(SLOT.d_median * PIXELS) + p] = upstream.median[y, x]
             buffer[u64(SLOT.alpha * PIXELS) + p] = A
 
 
 @inlined
-def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out):
+def _blame(space, s, row, hit, alpha, z, step, d_weight, k, channels, features, out):
     """Compute gradients of a splat's 16 pixels in its alpha and z; update the sums behind it.
 
     Returns:
         The splat's weights; alpha times the gradient in alpha; the gradient in z.
     """
     buffer, work = space.buffer, space.splat
-    zero, one, two = f32(0.0), f32(1.0), f32(2.0)
+    zero, one = f32(0.0), f32(1.0)
     alpha = select(hit, alpha, zero)
     rest = reciprocal(one - alpha)
     T = load(buffer, SLOT.transmittance * PIXELS + s) * rest
     w = alpha * T
     dz = z - load(buffer, SLOT.depth * PIXELS + s)
-    di = inverse_z - load(buffer, SLOT.inverse_depth * PIXELS + s)
     d_depth = load(buffer, SLOT.d_depth * PIXELS + s)
     d_ordered = load(buffer, SLOT.d_ordered * PIXELS + s)
-    d_inverse = load(buffer, SLOT.d_l2 * PIXELS + s) * di
     behind_alpha = load(buffer, SLOT.behind_alpha * PIXELS + s)
     behind_depth = load(buffer, SLOT.behind_depth * PIXELS + s)
     behind_loss = load(buffer, SLOT.behind_loss * PIXELS + s)
     signed_alpha = load(buffer, SLOT.signed_alpha * PIXELS + s)
     signed_depth = load(buffer, SLOT.signed_depth * PIXELS + s)
     # The gradient in the weight.
-    g = d_depth * dz + d_inverse * di + d_weight
+    g = d_depth * dz + d_weight
     for c in range(3):
         d_normal = load(buffer, (SLOT.d_normal + c) * PIXELS + s)
         g = g + d_normal * broadcast(work, row + SPLAT.normal + c)
@@ -334,8 +320,6 @@ def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
     in_z = w * (d_depth + d_ordered * (sign * front - signed_alpha))
     is_median = step == load(buffer, SLOT.median_step * PIXELS + s)
     in_z = in_z + select(is_median, load(buffer, SLOT.d_median * PIXELS + s), zero)
-    # Chain rule through 1/z: d(1/z)/dz = -1/z^2.
-    in_z = in_z - two * w * d_inverse * inverse_z * inverse_z
     unclamped = hit & (alpha < f32(ALPHA_MAX))
     in_alpha = select(unclamped, (T * g - behind_loss * rest) * alpha, zero)
     store(buffer, SLOT.transmittance * PIXELS + s, T)
@@ -478,16 +462,16 @@ def _splat_backward(space, table, view, tile, k, step, squares, d_weight, channe
         x, y = load(buffer, SLOT.x * PIXELS + s), load(buffer, SLOT.y * PIXELS + s)
         nx, ny = x - f32(dx), y - f32(dy)
         sx, sy = nx * f32(ROOT2), ny * f32(ROOT2)
-        inside, alpha, scaled, inverse = evaluate(
+        inside, alpha, scaled = evaluate(
             work, WORK.row, WORK.linear, nx, ny, sx, sy, discs, by_center
         )
-        z, inverse_z = depth_from(work, WORK.row, scaled, inverse, discs, by_center, zero, zero)
+        z = depth_from(work, WORK.row, scaled, discs, by_center, zero)
         hit = inside & (step <= load(buffer, SLOT.last_step * PIXELS + s))
         if not any_true(hit):
             continue
         hits += 1
         w, in_alpha, in_z = _blame(
-            space, s, WORK.row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
+            space, s, WORK.row, hit, alpha, z, step, d_weight, k, channels,
             table.features, rows[line],
         )  # fmt: skip
         f0, f1, f2, f3, f4, f5 = _add_features(buffer, s, w, (f0, f1, f2, f3, f4, f5))
@@ -527,7 +511,6 @@ def rasterize_backward(
     lists,
     table,
     background,  # (C,) float32
-    ndc_scale,
     pictures,
     upstream,
     target,
@@ -542,7 +525,6 @@ def rasterize_backward(
     the forward pass's state. A splat's sums stay in registers while its squares go by.
     """
     buffer, entries, channels = space.buffer, lists.entries, background.shape[0]
-    scale = f32(ndc_scale)
     for p in range(PIXELS):
         buffer[SLOT.x * PIXELS + p] = f32(p // 16 % SIDE * 4 + p % 4) - f32(TILE / 2 - 0.5)
         buffer[SLOT.y * PIXELS + p] = f32(p // (16 * SIDE) * 4 + p // 4 % 4) - f32(TILE / 2 - 0.5)
@@ -556,9 +538,9 @@ def rasterize_backward(
         for p in range(SLOT.transmittance * PIXELS, buffer.shape[0], 16):
             store(buffer, p, f32(0.0))
         if tile.rows == TILE and tile.columns == TILE and channels == 3:
-            _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream)
+            _load_whole_tile(buffer, tile, view, background, pictures, upstream)
         else:
-            _load_tile(buffer, tile, background, scale, pictures, upstream)
+            _load_tile(buffer, tile, background, pictures, upstream)
         for back in range(count):
             e = begin + count - 1 - back
             entry = entries[e]

@@ -162,9 +162,9 @@ def peak_terms(work, row, linear, x, y):
 
 @inlined
 def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
-    """Evaluate a splat at 16 pixels: coverage, alpha (arbitrary if not drawn), z and 1 / z.
+    """Evaluate a splat at 16 pixels: coverage, alpha (arbitrary if not drawn) and z.
 
-    The depths are scaled: of a 2D splat in units of its column ``depth``, except its centre's
+    The depth is scaled: of a 2D splat in units of its column ``depth``, except its centre's
     depth, which is then unused; see :func:`depth_from`.
 
     A 2D splat's W is clamped to the z that it may have, between w_low and w_high, before anything
@@ -186,10 +186,8 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
         w = linear_at(work, linear + LINEAR.w, row, DISC.w_x, x, y)
         u = linear_at(work, linear + LINEAR.u, row, DISC.u_x, x, y)
         v = linear_at(work, linear + LINEAR.v, row, DISC.v_x, x, y)
-        inverse_z = minimum(
-            maximum(w, broadcast(work, row + DISC.w_low)), broadcast(work, row + DISC.w_high)
-        )
-        z = reciprocal(inverse_z)
+        bounded = maximum(w, broadcast(work, row + DISC.w_low))
+        z = reciprocal(minimum(bounded, broadcast(work, row + DISC.w_high)))
         sx = screen_x + broadcast(work, linear + LINEAR.screen_x)
         sy = screen_y + broadcast(work, linear + LINEAR.screen_y)
         meets = w <= broadcast(work, row + DISC.w_most)
@@ -198,29 +196,21 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
         u, v = footprint_terms(work, row, linear, x, y)
         rho = u * u + v * v
         z = broadcast(work, row + SPLAT.depth_low)
-        inverse_z = broadcast(work, row + SPLAT.inverse_depth_low)
         if not by_center:
             low, high = z, broadcast(work, row + SPLAT.depth_high)
             along, _, _, inverse = peak_terms(work, row, linear, x, y)
             z = broadcast(work, row + SPLAT.depth) * along * inverse
             z = minimum(maximum(z, low), high)
-            inverse_z = reciprocal(z)
     inside = rho <= broadcast(work, row + SPLAT.cut)
     alpha = minimum(broadcast(work, row + SPLAT.opacity) * _gaussian(rho), f32(ALPHA_MAX))
-    return inside, alpha, z, inverse_z
+    return inside, alpha, z
 
 
 @inlined
-def depth_from(work, row, z, inverse_z, discs, by_center, z0, inverse_z0):
-    """Compute z - z0 and 1 / z - inverse_z0 from the scaled depths of :func:`evaluate`."""
+def depth_from(work, row, z, discs, by_center, z0):
+    """Compute z - z0 from the scaled depth of :func:`evaluate`."""
     if discs:
         if by_center:
-            return (
-                broadcast(work, row + SPLAT.depth_low) - z0,
-                broadcast(work, row + SPLAT.inverse_depth_low) - inverse_z0,
-            )
-        return (
-            fma(broadcast(work, row + SPLAT.depth), z, -z0),
-            fma(broadcast(work, row + DISC.inverse_depth), inverse_z, -inverse_z0),
-        )
-    return z - z0, inverse_z - inverse_z0
+            return broadcast(work, row + SPLAT.depth_low) - z0
+        return fma(broadcast(work, row + SPLAT.depth), z, -z0)
+    return z - z0

@@ -99,7 +99,6 @@ class SplatColumns(NamedTuple):
     depth_low: int = 12  # bounds of z at a pixel: the splat's own extent, and near
     depth_high: int = 13
     opacity: int = 14
-    inverse_depth_low: int = 16
     cut: int = 18  # drawn where rho <= cut; -1: nowhere
     normal: int = 22  # (3) in world axes
     values: int = 25  # (3) the first three channels
@@ -116,7 +115,6 @@ class DiscColumns(NamedTuple):
     w_x: int = 6
     w_y: int = 7
     w_most: int = 17  # the plane is nearer than near where W is larger
-    inverse_depth: int = 19
     w_high: int = 20  # bounds of W within the splat's extent
     w_low: int = 21
 
@@ -256,8 +254,7 @@ class Pictures(NamedTuple):
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
     ordered: np.ndarray  # (H, W)
-    l2: np.ndarray  # (H, W)
-    state: np.ndarray  # (5, H, W), see STATE; (5, 0, W) if there is no backward pass
+    state: np.ndarray  # (3, H, W), see STATE; (3, 0, W) if there is no backward pass
 
 
 class StatePlanes(NamedTuple):
@@ -266,8 +263,6 @@ class StatePlanes(NamedTuple):
     transmittance: int = 0  # behind all splats
     last_step: int = 1  # 1 + place in the list of the last splat drawn; 0: none
     median_step: int = 2
-    inverse_depth: int = 3  # mean of 1 / z
-    variance: int = 4  # of 1 / z, times alpha
 
 
 STATE = StatePlanes()
@@ -293,7 +288,6 @@ class Upstream(NamedTuple):
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
     ordered: np.ndarray  # (H, W)
-    l2: np.ndarray  # (H, W)
     weight: np.ndarray  # (M,), in the order of depth
 
 

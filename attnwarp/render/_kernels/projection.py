@@ -334,7 +334,6 @@ def _disc(batch, singles, view, a, c, s, length, spread, cut, step):
     _put(batch, DISC.w_x, wx)
     _put(batch, DISC.w_y, wy)
     _put_single(singles, DISC.w_most, c.z * (1.0 / view.near))
-    _put_single(singles, DISC.inverse_depth, reciprocal(c.z))
     # Where it shows by its intersection, z lies between these.
     reach = spread * EXTENT_SIGMAS
     _put_single(singles, DISC.w_high, c.z * reciprocal(maximum(c.z - reach, view.near)))
@@ -526,7 +525,6 @@ def _project_batch(batch, singles, view, R, c, ic, x0, y0, step):
     _put_single(singles, SPLAT.depth_low, low)
     _put_single(singles, SPLAT.depth_high, high)
     _put_single(singles, SPLAT.opacity, opacity)
-    _put_single(singles, SPLAT.inverse_depth_low, reciprocal(low))
     _put_single(singles, SPLAT.cut, cut)
     _put_single(singles, SPLAT.normal, flip * p0)
     _put_single(singles, SPLAT.normal + 1, flip * p1)

@@ -36,7 +36,6 @@ from attnwarp.render._kernels.lanes import (
     interleave4,
     load,
     lowest_bit,
-    maximum,
     reciprocal,
     select,
     store,
@@ -93,22 +92,16 @@ class Slots(NamedTuple):
     x: int = 0  # from the middle of its quarter of the tile
     y: int = 1
     transmittance: int = 2
-    depth: int = 3  # from here to l2: made of the sums when the tile is done
-    inverse_depth: int = 4
-    variance: int = 5
-    l2: int = 6
-    alpha: int = 7
-    depth_sum: int = 8  # sum w (z - first_depth)
-    inverse_sum: int = 9  # sum w (1/z - first_inverse)
-    inverse_square_sum: int = 10
-    ordered: int = 11
-    median: int = 12
-    median_step: int = 13
-    last_step: int = 14
-    first_depth: int = 15
-    first_inverse: int = 16
-    normal: int = 17  # (3)
-    color: int = 20  # (channels)
+    depth: int = 3  # made of the sums when the tile is done
+    alpha: int = 4
+    depth_sum: int = 5  # sum w (z - first_depth)
+    ordered: int = 6
+    median: int = 7
+    median_step: int = 8
+    last_step: int = 9
+    first_depth: int = 10
+    normal: int = 11  # (3)
+    color: int = 14  # (channels)
 
 
 SLOT = Slots()
@@ -170,13 +163,12 @@ def _prefetch_pictures(pictures, tile, width, channels):
         prefetch_to_write(pictures.depth, to)
         prefetch_to_write(pictures.median, to)
         prefetch_to_write(pictures.ordered, to)
-        prefetch_to_write(pictures.l2, to)
         prefetch_to_write(pictures.normal, 3 * to)
         prefetch_to_write(pictures.normal, 3 * to + 3 * tile.columns - 1)
         prefetch_to_write(pictures.color, channels * to)
         prefetch_to_write(pictures.color, channels * (to + tile.columns) - 1)
         if pictures.state.shape[1] > 0:
-            for k in range(5):
+            for k in range(pictures.state.shape[0]):
                 prefetch_to_write(pictures.state, k * plane + to)
 
 
@@ -240,20 +232,19 @@ def _in_block(masks, squares):
 
 
 @inlined
-def _first_and_median(work, row, hit, T, z, inverse_z, discs, by_center, zero, sums):
+def _first_and_median(work, row, hit, T, z, discs, by_center, zero, sums):
     """Take a splat as the first of a pixel, and as its median, where it is that.
 
     Args:
         T: transmittance in front of it.
-        sums: first_depth, first_inverse, median, median_step.
+        sums: first_depth, median, median_step.
     """
-    first_depth, first_inverse, median, median_step = sums
-    depth, inverse = depth_from(work, row, z, inverse_z, discs, by_center, zero, zero)
+    first_depth, median, median_step = sums
+    depth = depth_from(work, row, z, discs, by_center, zero)
     opens, is_first = hit & (f32(MEDIAN_TRANSMITTANCE) < T), hit & (f32(1.0) <= T)
     step = broadcast(work, row + TILE_ROW.step)
     return (
         select(is_first, depth, first_depth),
-        select(is_first, inverse, first_inverse),
         select(opens, depth, median),
         select(opens, step, median_step),
     )
@@ -277,8 +268,6 @@ def _composite_square(space, q, left, view, channels, keep):
     sx, sy = x * f32(ROOT2), y * f32(ROOT2)
     T, A = load(buffer, SLOT.transmittance * PIXELS + s), load(buffer, SLOT.alpha * PIXELS + s)
     depth_sum = load(buffer, SLOT.depth_sum * PIXELS + s)
-    inverse_sum = load(buffer, SLOT.inverse_sum * PIXELS + s)
-    square_sum = load(buffer, SLOT.inverse_square_sum * PIXELS + s)
     ordered = load(buffer, SLOT.ordered * PIXELS + s)
     last_step = load(buffer, SLOT.last_step * PIXELS + s)
     n0 = load(buffer, SLOT.normal * PIXELS + s)
@@ -288,7 +277,6 @@ def _composite_square(space, q, left, view, channels, keep):
     c1 = load(buffer, (SLOT.color + 1) * PIXELS + s)
     c2 = load(buffer, (SLOT.color + 2) * PIXELS + s)
     first_depth = load(buffer, SLOT.first_depth * PIXELS + s)
-    first_inverse = load(buffer, SLOT.first_inverse * PIXELS + s)
     median = load(buffer, SLOT.median * PIXELS + s)
     median_step = load(buffer, SLOT.median_step * PIXELS + s)
     # What only the first splats of a pixel decide: once no pixel is undecided, that is over for a
@@ -297,18 +285,18 @@ def _composite_square(space, q, left, view, channels, keep):
     alive = stop < T
     used, composited, contributing, ends_with = 0, 0, 0, -1
     ahead = lowest_bit(left)
-    inside_ahead, alpha_ahead, z_ahead, inverse_ahead = evaluate(
+    inside_ahead, alpha_ahead, z_ahead = evaluate(
         work, ahead * ROW, BLOCK_WORK.linear + ahead * 8, x, y, sx, sy, discs, by_center
     )
     while True:
-        k, inside, alpha, z, inverse_z = ahead, inside_ahead, alpha_ahead, z_ahead, inverse_ahead
+        k, inside, alpha, z = ahead, inside_ahead, alpha_ahead, z_ahead
         row = k * ROW
         left &= left - 1
         if left != 0:
             # One splat ahead: a long chain of operations that wait for each other, while the sums
             # of the one at hand wait for nothing.
             ahead = lowest_bit(left)
-            inside_ahead, alpha_ahead, z_ahead, inverse_ahead = evaluate(
+            inside_ahead, alpha_ahead, z_ahead = evaluate(
                 work, ahead * ROW, BLOCK_WORK.linear + ahead * 8, x, y, sx, sy, discs, by_center
             )
         hit = inside & alive
@@ -316,17 +304,12 @@ def _composite_square(space, q, left, view, channels, keep):
         if keep:
             last_step = select(hit, broadcast(work, row + TILE_ROW.step), last_step)
         if undecided:
-            first_depth, first_inverse, median, median_step = _first_and_median(
-                work, row, hit, T, z, inverse_z, discs, by_center, zero,
-                (first_depth, first_inverse, median, median_step),
-            )  # fmt: skip
-        depth, inverse = depth_from(
-            work, row, z, inverse_z, discs, by_center, first_depth, first_inverse
-        )
-        w_depth, w_inverse = w * depth, w * inverse
+            first_depth, median, median_step = _first_and_median(
+                work, row, hit, T, z, discs, by_center, zero, (first_depth, median, median_step)
+            )
+        w_depth = w * depth_from(work, row, z, discs, by_center, first_depth)
         ordered = ordered + absolute(w_depth * A - w * depth_sum)
         A, depth_sum = A + w, depth_sum + w_depth
-        inverse_sum, square_sum = inverse_sum + w_inverse, square_sum + w_inverse * inverse
         n0 = n0 + w * broadcast(work, row + SPLAT.normal)
         n1 = n1 + w * broadcast(work, row + SPLAT.normal + 1)
         n2 = n2 + w * broadcast(work, row + SPLAT.normal + 2)
@@ -353,8 +336,6 @@ def _composite_square(space, q, left, view, channels, keep):
     store(buffer, SLOT.transmittance * PIXELS + s, T)
     store(buffer, SLOT.alpha * PIXELS + s, A)
     store(buffer, SLOT.depth_sum * PIXELS + s, depth_sum)
-    store(buffer, SLOT.inverse_sum * PIXELS + s, inverse_sum)
-    store(buffer, SLOT.inverse_square_sum * PIXELS + s, square_sum)
     store(buffer, SLOT.ordered * PIXELS + s, ordered)
     store(buffer, SLOT.last_step * PIXELS + s, last_step)
     store(buffer, SLOT.normal * PIXELS + s, n0)
@@ -364,7 +345,6 @@ def _composite_square(space, q, left, view, channels, keep):
     store(buffer, (SLOT.color + 1) * PIXELS + s, c1)
     store(buffer, (SLOT.color + 2) * PIXELS + s, c2)
     store(buffer, SLOT.first_depth * PIXELS + s, first_depth)
-    store(buffer, SLOT.first_inverse * PIXELS + s, first_inverse)
     store(buffer, SLOT.median * PIXELS + s, median)
     store(buffer, SLOT.median_step * PIXELS + s, median_step)
     return used, composited, contributing, ends_with
@@ -401,19 +381,12 @@ def _entry_weights(space, size, weights):
 
 
 @inlined
-def _finish(buffer, background, ndc_scale):
-    """Make depths, distortions and colours of a tile's sums."""
+def _finish(buffer, background):
+    """Make depths, the distortion and colours of a tile's sums."""
     for p in range(0, PIXELS, 16):
         A = load(buffer, SLOT.alpha * PIXELS + p)
         covered = f32(0.0) < A
         inverse = select(covered, reciprocal(A), f32(0.0))
-        first_moment = load(buffer, SLOT.inverse_sum * PIXELS + p)
-        second_moment = load(buffer, SLOT.inverse_square_sum * PIXELS + p)
-        variance = maximum(second_moment - first_moment * first_moment * inverse, f32(0.0))
-        store(buffer, SLOT.variance * PIXELS + p, variance)
-        store(buffer, SLOT.l2 * PIXELS + p, A * variance * ndc_scale)
-        first_inverse = load(buffer, SLOT.first_inverse * PIXELS + p)
-        store(buffer, SLOT.inverse_depth * PIXELS + p, first_inverse + first_moment * inverse)
         depth = load(buffer, SLOT.first_depth * PIXELS + p)
         depth = depth + load(buffer, SLOT.depth_sum * PIXELS + p) * inverse
         store(buffer, SLOT.depth * PIXELS + p, select(covered, depth, f32(np.nan)))
@@ -440,7 +413,6 @@ def _write_whole_tile(buffer, pictures, tile, width):
         copy4(pictures.depth, to, buffer, SLOT.depth * PIXELS + p)
         copy4(pictures.median, to, buffer, SLOT.median * PIXELS + p)
         copy4(pictures.ordered, to, buffer, SLOT.ordered * PIXELS + p)
-        copy4(pictures.l2, to, buffer, SLOT.l2 * PIXELS + p)
         interleave4(pictures.color, 3 * to, buffer, SLOT.color * PIXELS + p, PIXELS)
         interleave4(pictures.normal, 3 * to, buffer, SLOT.normal * PIXELS + p, PIXELS)
         if pictures.state.shape[1] > 0:
@@ -448,8 +420,6 @@ def _write_whole_tile(buffer, pictures, tile, width):
             copy4(state, to + STATE.transmittance * plane, buffer, SLOT.transmittance * PIXELS + p)
             copy4(state, to + STATE.last_step * plane, buffer, SLOT.last_step * PIXELS + p)
             copy4(state, to + STATE.median_step * plane, buffer, SLOT.median_step * PIXELS + p)
-            copy4(state, to + STATE.inverse_depth * plane, buffer, SLOT.inverse_depth * PIXELS + p)
-            copy4(state, to + STATE.variance * plane, buffer, SLOT.variance * PIXELS + p)
 
 
 @inlined
@@ -464,7 +434,6 @@ def _write_tile(buffer, pictures, tile):
             pictures.depth[y, x] = buffer[u64(SLOT.depth * PIXELS) + p]
             pictures.median[y, x] = buffer[u64(SLOT.median * PIXELS) + p]
             pictures.ordered[y, x] = buffer[u64(SLOT.ordered * PIXELS) + p]
-            pictures.l2[y, x] = buffer[u64(SLOT.l2 * PIXELS) + p]
             for c in range(pictures.color.shape[2]):
                 pictures.color[y, x, u64(c)] = buffer[u64((SLOT.color + c) * PIXELS) + p]
             for c in range(3):
@@ -473,8 +442,6 @@ def _write_tile(buffer, pictures, tile):
                 state[STATE.transmittance, y, x] = buffer[u64(SLOT.transmittance * PIXELS) + p]
                 state[STATE.last_step, y, x] = buffer[u64(SLOT.last_step * PIXELS) + p]
                 state[STATE.median_step, y, x] = buffer[u64(SLOT.median_step * PIXELS) + p]
-                state[STATE.inverse_depth, y, x] = buffer[u64(SLOT.inverse_depth * PIXELS) + p]
-                state[STATE.variance, y, x] = buffer[u64(SLOT.variance * PIXELS) + p]
 
 
 @bare
@@ -487,7 +454,6 @@ def rasterize(
     lists,
     table,
     background,  # (C,) float32
-    ndc_scale,
     pictures,
     progress,
     space,
@@ -499,7 +465,6 @@ def rasterize(
     and composites them with its sums in registers.
 
     Args:
-        ndc_scale: the factor from variances of 1 / z to ``distortion_l2_ndc``.
         pictures, progress: written to.
         space: a ``Workspace``.
     """
@@ -559,7 +524,7 @@ def rasterize(
         progress.tested[t] = tested
         progress.composited[t] = composited
         progress.contributing[t] = contributing
-        _finish(buffer, background, f32(ndc_scale))
+        _finish(buffer, background)
         if tile.rows == TILE and tile.columns == TILE and channels == 3:
             _write_whole_tile(buffer, pictures, tile, view.width)
         else:

@@ -655,7 +655,6 @@ def test_settings_survive_json():
         ({"densify": 1}, "densify: got 1, expected true or false"),
         ({"background": "blue"}, "background: got 'blue'"),
         ({"antialiased": True}, "antialiased: applies to kind '3d' only"),
-        ({"distortion_form": "l2"}, "distortion_form: got 'l2'"),
         ({"iterations": True}, "iterations: got True"),
         ({"reset_opacity": 1}, "reset_opacity: got 1, expected a number in"),
     ],

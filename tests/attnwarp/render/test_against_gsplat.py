@@ -119,9 +119,8 @@ def test_an_off_centre_principal_point_agrees(make_splats) -> None:
 
 def without_stop(splats, camera) -> Outputs:
     """The reference, its rays going on for ever."""
-    ndc = (constants.NDC_NEAR, constants.NDC_FAR)
     inputs = api._prepare(
-        splats, camera, "center", None, None, None, constants.NEAR, None, None, ndc, on_cpu=True
+        splats, camera, "center", None, None, None, constants.NEAR, None, None, on_cpu=True
     )
     return reference.render(inputs, reference.Thresholds(stop=0.0))
 

@@ -38,9 +38,6 @@ def test_two_hundred_random_scenes_agree_to_1e_5(
         count = int(rng.integers(1, 40)) if seed % 5 == 0 else int(rng.integers(12, 40))
         splats = make_splats(seed, kind, count, camera, degree=seed % 4)
         options: dict[str, object] = {"depth": mode, "antialiased": antialiased}
-        # With the distortion's near plane at the picture's, m lies in [0, 1]; at 0.2 it reaches -19
-        # for what is nearer.
-        options["ndc"] = (constants.NEAR, constants.NDC_FAR)
         if seed % 3 == 0:
             options["features"] = torch.tensor(rng.normal(size=(count, seed % 7 + 1)))
             options["background"] = torch.tensor(rng.normal(size=seed % 7 + 1))
@@ -61,7 +58,7 @@ def test_pictures_of_many_tiles_agree(
     splats = make_splats(11, kind, 40, camera)
     splats.scales[::4] *= 20
     options = {"depth": mode, "antialiased": antialiased}
-    inputs = prepared(splats, camera, ndc=(constants.NEAR, constants.NDC_FAR), **options)
+    inputs = prepared(splats, camera, **options)
     worst = excess(inputs, backend=backend)
     assert max(worst.values()) < 1e-5, worst
     if width == 300:
@@ -363,7 +360,7 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
 
 
 READ_BY_OWN_GRADIENTS = {
-    "alpha": {"depth", "distortion_ordered", "distortion_l2_ndc"},
+    "alpha": {"depth", "distortion_ordered"},
     "depth": {"depth", "distortion_ordered"},
 }
 

@@ -38,7 +38,6 @@ def camera(width: int = 12, height: int = 10) -> Camera:
         ({"depth": "peak"}, "depth: 'peak' is for kind '3d'"),
         ({"near": 0.0}, "near: got 0.0, expected a positive depth"),
         ({"near": float("nan")}, "near: got nan"),
-        ({"ndc": (2.0, 1.0)}, "ndc: got"),
         (
             {"background": [1.0, 0.0]},
             r"background: got shape \(2\), expected \(3\)|background: got shape \(2,\)",
