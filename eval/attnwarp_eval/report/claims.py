@@ -9,11 +9,16 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
+from attnwarp.errors import InputError
 from attnwarp_eval.scene.yaml import read_yaml
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.schema import Study
 
 DECLARED = resources.files("attnwarp_eval.report") / "claims.yaml"
+USED = resources.files("attnwarp_eval.report") / "used_seeds.yaml"
+
+FIRST_SEED = 1001
+"""Least seed of scenes that claims of the third edition on may draw by."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +80,32 @@ class Claim:
         return self.scenes is None or {"seeds": [0], **self.scenes} == has
 
 
+def check_seeds(family: Mapping[str, Any]) -> None:
+    """Check that no claim is made on scenes that were looked at before it.
+
+    Raises:
+        InputError: the family is of the third edition or later, and draws by a seed that is too
+            small, or that something else than the claims' own study has used.
+    """
+    if family["edition"] < 3:
+        return
+    used = read_yaml(USED.read_text())[1]
+    for study, scenes in family["scenes"].items():
+        seed = scenes["seed"]
+        others = [name for name in used.get(str(seed), []) if name != study]
+        if seed < FIRST_SEED or others:
+            who = ", ".join(others) or "earlier work"
+            raise InputError(
+                f"scenes of {study}: got seed {seed}, used by {who};"
+                f" take one of {FIRST_SEED} and up that is not in {USED.name}"
+            )
+
+
 @cache
 def load_claims() -> tuple[Claim, ...]:
     """Load the bundled claims."""
     family = read_yaml(DECLARED.read_text())[1]
+    check_seeds(family)
     return tuple(
         Claim(**entry, scenes=family["scenes"][entry["study"]]) for entry in family["claims"]
     )

@@ -6,16 +6,19 @@ import functools
 import itertools
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import written_runs
 from scipy import stats
 
+from attnwarp.errors import InputError
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
+from attnwarp_eval.report import claims
 from attnwarp_eval.report.ablations import compared_of, differences, glossary, in_detail
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, load_claims
@@ -30,6 +33,7 @@ from attnwarp_eval.report.judging import (
     outcome,
 )
 from attnwarp_eval.report.measured import regime
+from attnwarp_eval.scene.yaml import read_yaml
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
@@ -38,6 +42,7 @@ from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.study import load_study, parse_variant
 
+ROOT = Path(__file__).parents[3]
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
 
@@ -522,6 +527,37 @@ def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
         assert claim.study and (
             claim.bound is None or isinstance(claim.equal_within, str) == percent
         )
+
+
+def family(edition, seed):
+    return {"edition": edition, "scenes": {"suite": {"drawn": 40, "seed": seed}}}
+
+
+def test_a_claim_of_the_third_edition_on_a_used_seed_is_refused_and_an_older_one_is_not(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "used_seeds.yaml").write_text("1001: [suite]\n1002: [suite, pilot]\n")
+    monkeypatch.setattr(claims, "USED", tmp_path / "used_seeds.yaml")
+    for edition, seed in ((2, 201), (3, 1001), (3, 1003)):
+        claims.check_seeds(family(edition, seed))
+    for seed, who in ((1002, "pilot"), (1000, "earlier work")):
+        with pytest.raises(InputError, match=f"suite: got seed {seed}, used by {who}; take one of"):
+            claims.check_seeds(family(3, seed))
+
+
+def test_the_list_of_used_seeds_has_every_seed_of_studies_and_reports():
+    used = {int(seed) for seed in read_yaml(claims.USED.read_text())[1]}
+    studies = [
+        *(ROOT / "eval").glob("*/studies/*.yaml"),
+        *(ROOT / "eval").glob("*/study/shipped/*.yaml"),
+    ]
+    found = {}
+    for path in [*studies, *(ROOT / "reports").rglob("*.md")]:
+        text = path.read_text()
+        for pattern in (r"generator 1, seeds? (\d+)", r"drawn: \d+, [^}]*seed: (\d+)"):
+            found |= {int(seed): path.name for seed in re.findall(pattern, text)}
+    assert len(studies) > 15 and len(found) > 15
+    assert {seed: name for seed, name in found.items() if seed not in used} == {}
 
 
 def test_lines_of_the_readme_are_numbered_from_one_and_at_most_five():
