@@ -261,7 +261,7 @@ def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
 
 
 def test_the_first_picture_of_a_large_scene_fits_in_memory(tmp_path):
-    """A hollow ball of 200,000 discs, from inside: 1.0 GiB (reports/inspect/first-picture.md)."""
+    """A hollow ball of 200,000 discs, from inside: 1.0 GiB (reports/inspect at commit 29727b66)."""
     random = torch.Generator().manual_seed(0)
     away = torch.nn.functional.normalize(torch.randn((200_000, 3), generator=random), dim=1)
     # The rotation from the z axis to the normal; discs whose areas add up to 1.5 of the ball's.

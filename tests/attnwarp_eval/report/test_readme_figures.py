@@ -1,4 +1,4 @@
-"""Every figure that README.md prints of a measurement, recomputed from the raw results or the page of its report."""
+"""Every figure of a measurement in README.md and reports/README.md, recomputed from raw results or a report's page."""
 
 import json
 import lzma
@@ -207,3 +207,159 @@ def test_no_other_figure_stands_in_what_it_finds_and_what_it_cannot_do():
         text = text.replace(phrase, "")
     text = re.sub(r"\]\([^)]*\)|Apache License 2\.0", "", text)
     assert re.findall(r"[^.]*\d[^.]*", text) == []
+
+
+# reports/README.md ----------------------------------------------------------------------------------------------------
+
+REPORTS = " ".join((ROOT / "reports/README.md").read_text().split())
+
+
+def in_page(path, pattern):
+    """The groups of a pattern in a page, whose line breaks are spaces."""
+    return re.search(pattern, " ".join(page(path).split())).groups()
+
+
+def scenes_of(study):
+    return len({one["cell"]["scene"] for one in cells(study)})
+
+
+def masks_and_fits():
+    """Rows on geometry, warps and masks."""
+    hidden = in_page(
+        "suite/report.md",
+        r"(\S+ %) of what the paper's mask accepts is hidden from the source, (\S+ %) of",
+    )
+    (scenes,) = in_page("suite/report.md", r"means over (\d+) scenes")
+    yield "{} of what the paper's mask accepts is hidden, and {} of what `corrected`".format(
+        *hidden
+    )
+    yield f"over {scenes} drawn scenes"
+    yield f"Of {scenes_of('fitted')} drawn scenes, normals are closer"
+    fits = lines("iterations")[0]["study"]["variants"]
+    few, most = (f(one["fit"]["iterations"] for one in fits.values()) for f in (min, max))
+    yield f"What {few} to {most:,} iterations of a fit give"
+    yield f"CPU seconds, on {scenes_of('iterations')} drawn scenes"
+    yield f"lets more through, on {scenes_of('rules')} drawn scenes"
+    (up,) = in_page("labels/report.md", r"\| exact depth \| labels.net \| \+(\S+) points")
+    (down,) = in_page("labels/report.md", r"\| no mask \| labels.net \| -(\S+) points")
+    yield (
+        f"puts exact depth {up} points before `corrected`, and this {down} points before no mask,"
+        f" on {scenes_of('labels')} drawn scenes"
+    )
+    one, three = in_page(
+        "masks/report.md", r"does not show it is (\d+ %) and .* around the scene give (\d+ %)"
+    )
+    yield f"overlaps its thing by {one} at 60 degrees, and three masks by {three}"
+    scores = json.loads(page("bench/unedited.json"))
+    of = {one["scene"] for one in scores["scores"]}
+    yield f"{len(of)} drawn scenes of {scores['bench']['size']} px; nothing is judged"
+    (sweeps,) = hard_inputs()
+    yield f"Of {re.search(r'[0-9]+', sweeps)[0]} sweeps of hard inputs all hold"
+
+
+def other_meshes():
+    """Differences from `corrected` in two tables, told apart on meshes, and their signs in suite."""
+
+    def table(path, caption):
+        rows = page(path).split(f"**{caption}**\n\n")[1].split("\n\n")[0].splitlines()[2:]
+        cut = [[cell.strip() for cell in row.strip("| ").split(" | ")] for row in rows]
+        return {name: cells for name, *cells in cut}
+
+    def gap(rows, name, column):
+        value, base = (float(rows[one][column].split()[0]) for one in (name, "corrected"))
+        return value > base
+
+    signs = []
+    for caption in (
+        "Presets and rules of the mask",
+        "Where the depth comes from, as the warp sees it",
+    ):
+        suite, meshes = (table(f"{name}/report.md", caption) for name in ("suite", "suite-meshes"))
+        for name in suite.keys() & meshes.keys():
+            for column, cell in enumerate(meshes[name]):
+                if cell.endswith(("better", "worse")):
+                    signs.append(gap(suite, name, column) == gap(meshes, name, column))
+    assert all(signs)
+    (scenes,) = in_page("suite-meshes/report.md", r"means over (\d+) scenes")
+    yield f"The {len(signs)} differences of warps that are told apart on {scenes} scenes"
+
+
+def edits():
+    """Rows on edits."""
+    shares = in_page(
+        "README.md",
+        r"its weights and its mask together, brings [^|]*\|[^|]*\|[^|]*\| (\d+ %) against (\d+ %)",
+    )
+    yield "`extended` brings {} of the parts that the source shows to its answer, `corrected` {}.".format(
+        *shares
+    )
+    yield f"[at {lines('ideal-256')[0]['study']['size']} px](ideal-256/report.md)"
+    edge, exact = (
+        in_page("depth-edges/report.md", rf"\| {name} \| [^|]* \| [^|]* \| -(\d+) points")[0]
+        for name in ("corrected", "exact geometry")
+    )
+    yield f"right {edge} points less often at a depth edge than away, and those of exact geometry {exact}"
+    ideal, bundled = (re.findall(r"(\d+) %", told)[0] for told in [*drifts()][:2])
+    yield f"by 2 px costs attention warping {ideal} % of its gain with the ideal editor, and {bundled} %"
+    for study in ("ablation", "comparison"):
+        yield f"at {lines(study)[0]['study']['size']} px"
+    row = in_page("editing/time.md", r"\| default \| (?:[^|]* \| ){7}(\d+) \| (\d+), ")
+    yield "An edit of {1} views, fit included, takes {0} s".format(*row)
+
+
+def instruments():
+    """Rows on metrics and truth, and what the audit says of encoders."""
+    yield f"can be believed, on {scenes_of('audit')} drawn scenes"
+    yield f"[at {lines('audit-256')[0]['study']['size']} px](audit-256/report.md)"
+    scenes, certified = in_page(
+        "effects/effects.md", r"(\d+) scenes, (\d+) of their plans certified"
+    )
+    yield f"with proofs: {certified} of {scenes} plans are certified"
+    (flaws,) = in_page("audit/report.md", r"sees, of (\d+) flaws")
+
+    def blind(name):
+        (listed,) = in_page("audit/report.md", rf"\| {name} \| [^|]* \| [^|]* \| ([^|]*) \|")
+        return len(listed.split(", "))
+
+    yield f"similarity to words blind to {blind('CLIP similarity')} of {flaws} flaws"
+    yield f"its directional similarity to {blind('CLIP directional similarity')}"
+    (seen,) = in_page("audit/report.md", r"\| DINO between neighbours \| [^|]* \| (\d+): ")
+    yield f"DINO between neighbours sees {seen}."
+    (most,) = in_page("scale/report.md", r"(100,000)")
+    yield f"[{most} cells](scale/report.md)"
+
+
+ROWS = (masks_and_fits, other_meshes, edits, instruments)
+
+
+@pytest.mark.parametrize("topic", ROWS)
+def test_the_table_of_reports_prints_what_they_give(topic):
+    missing = [phrase for phrase in topic() if phrase not in REPORTS]
+    assert missing == []
+
+
+def test_no_other_figure_stands_in_the_table_of_reports():
+    """The block between the marks is that of the verdicts, which test_verdicts.py recomputes."""
+    text = REPORTS.partition("<!-- /verdicts -->")[2]
+    for phrase in [
+        *(phrase for topic in ROWS for phrase in topic()),
+        *DEFINITIONS,
+        "3DGS",
+        "0.5 dB",
+    ]:
+        text = text.replace(phrase, "")
+    text = re.sub(r"\]\([^)]*\)|`[^`]*`|\b[0-9a-f]{8}\b", "", text)
+    assert re.findall(r"[^.]*\d[^.]*", text) == []
+
+
+def test_there_are_at_most_25_reports_a_row_is_one_sentence_and_each_link_is_there():
+    folder, text = ROOT / "reports", page("README.md").partition("<!-- /verdicts -->")[2]
+    tables = text.partition("## Which seconds")[0]
+    rows = re.findall(r"^\| \[([\w-]+)\]\(\S+\) \| (.*) \|$", tables, re.MULTILINE)
+    assert 20 <= len(rows) <= 25
+    for name, said in rows:
+        assert said.endswith((".", ")")) and len(re.findall(r"\. [A-Z]", said)) == 0, name
+    linked = re.findall(r"\]\(([^)#]+)[^)]*\)", page("README.md"))
+    assert [link for link in linked if not (folder / link).exists()] == []
+    named = {link.split("/")[0] for link in linked if not link.startswith("..")}
+    assert {path.name for path in folder.iterdir() if path.is_dir()} == named
