@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,7 +63,7 @@ def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool 
 
 
 def read_as(kind: type[T], path: Path, remedy: str) -> T:
-    """Read a JSON file as a model or dataclass of pydantic.
+    """Read a JSON file, or one compressed as ``.xz``, as a model or dataclass of pydantic.
 
     Args:
         kind: class of the content.
@@ -75,11 +76,14 @@ def read_as(kind: type[T], path: Path, remedy: str) -> T:
     from pydantic import TypeAdapter, ValidationError
 
     try:
-        return TypeAdapter(kind).validate_json(read_text(path))
+        text = lzma.decompress(path.read_bytes()) if path.suffix == ".xz" else read_text(path)
+        return TypeAdapter(kind).validate_json(text)
     except OSError as error:
         why = "is missing" if isinstance(error, FileNotFoundError) else str(error.strerror)
     except UnicodeDecodeError:
         why = "is no text"
+    except lzma.LZMAError:
+        why = "is no xz file, or cut off"
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the file"

@@ -1,6 +1,7 @@
 """Oracles: figures put in by hand, whose means and paired differences are known."""
 
 import json
+import lzma
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +45,18 @@ def read(tmp_path, data):
     return result.Result.read(path)
 
 
-@pytest.mark.parametrize("path", sorted(REPORTS.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(REPORTS.glob("*.json.xz")), ids=lambda path: path.stem)
 def test_every_result_of_the_table_has_the_format_and_one_bench(path):
-    one, first = (result.Result.read(p) for p in (path, min(REPORTS.glob("*.json"))))
+    one, first = (result.Result.read(p) for p in (path, min(REPORTS.glob("*.json.xz"))))
     assert one.bench == first.bench and one.method.name
-    assert path.read_text() == written(one, path.parent / "never.json")
+    assert lzma.decompress(path.read_bytes()).decode() == written(one, path.parent / "never.json")
+
+
+def test_a_compressed_result_that_was_cut_off_is_refused(tmp_path):
+    path = tmp_path / "one.json.xz"
+    path.write_bytes(min(REPORTS.glob("*.json.xz")).read_bytes()[:5000])
+    with pytest.raises(InputError, match=r"one\.json\.xz: is no xz file, or cut off; make it with"):
+        result.Result.read(path)
 
 
 def written(one, path):
@@ -60,7 +68,7 @@ def written(one, path):
 
 
 def test_the_table_is_made_of_the_results_beside_it():
-    results = [result.Result.read(path) for path in sorted(REPORTS.glob("*.json"))]
+    results = [result.Result.read(path) for path in sorted(REPORTS.glob("*.json.xz"))]
     from attnwarp_eval.document.write import markdown
 
     assert (REPORTS / "bench.md").read_text() == markdown(result.compare(results))
