@@ -36,7 +36,7 @@ def lines(study):
 
 
 def cells(study):
-    return [one for one in lines(study) if "cell" in one]
+    return [one for one in lines(study) if one.get("record")]
 
 
 def page(path):
@@ -238,7 +238,8 @@ def masks_and_fits():
     fits = lines("iterations")[0]["study"]["variants"]
     few, most = (f(one["fit"]["iterations"] for one in fits.values()) for f in (min, max))
     yield f"What {few} to {most:,} iterations of a fit give"
-    yield f"CPU seconds, on {scenes_of('iterations')} drawn scenes"
+    yield "of which few have 7,000"
+    yield f"labels and pictures, on {scenes_of('iterations')} drawn scenes"
     yield f"lets more through, on {scenes_of('rules')} drawn scenes"
     (up,) = in_page("labels/report.md", r"\| exact depth \| labels.net \| \+(\S+) points")
     (down,) = in_page("labels/report.md", r"\| no mask \| labels.net \| -(\S+) points")
@@ -363,3 +364,57 @@ def test_there_are_at_most_25_reports_a_row_is_one_sentence_and_each_link_is_the
     assert [link for link in linked if not (folder / link).exists()] == []
     named = {link.split("/")[0] for link in linked if not link.startswith("..")}
     assert {path.name for path in folder.iterdir() if path.is_dir()} == named
+
+
+# docs/method/fitting.md -----------------------------------------------------------------------------------------------
+
+
+def iterations():
+    """CPU seconds and depth error, over the scenes that have them all."""
+    seconds = defaultdict(dict)
+    for one in cells("iterations"):
+        if one["cell"]["probe"] == "fit":
+            point = one["record"]["curve"][-1]
+            seconds[one["cell"]["variants"][0]][one["cell"]["scene"]] = point["cpu_seconds"]
+
+    def told(*variants):
+        scenes = set.intersection(*(set(seconds[each]) for each in variants))
+        depth = [by_scene("iterations", "fit", "depth.abs_rel", each) for each in variants]
+        return (
+            len(scenes),
+            *(np.mean([seconds[each][scene] for scene in scenes]) for each in variants),
+            *(100 * np.mean([each[scene] for scene in scenes]) for each in depth),
+        )
+
+    yield (
+        "on {} drawn scenes of 128 px, 300, 1,000 and 3,000 iterations take {:.0f}, {:.0f} and {:.0f}"
+        " CPU seconds and leave a depth error of {:.1f}, {:.1f} and {:.1f} %"
+    ).format(*told("300", "1,000", "3,000"))
+    yield (
+        "On the {0} that have 7,000, these take {2:.0f} CPU seconds for {1:.0f} of 3,000, and leave"
+        " {4:.1f} % for {3:.1f} %"
+    ).format(*told("3,000", "7,000"))
+
+
+def harmonics():
+    """What a later degree of the harmonics saves and costs."""
+    rows = [json.loads(line) for line in page("iterations/harmonics.jsonl").splitlines()]
+
+    def ratio(figure, scene):
+        late, early = (
+            np.mean([row[figure] for row in rows if (row["scene"], row["sh_every"]) == (scene, s)])
+            for s in (0.25, 0.14)
+        )
+        return 100 * (late / early - 1)
+
+    scenes = sorted({row["scene"] for row in rows})
+    saved = -np.mean([ratio("cpu_seconds", scene) for scene in scenes])
+    costs = [ratio("depth.abs_rel", scene) for scene in scenes]
+    yield f"0.25 saves {saved:.0f} % of the CPU seconds of 2,000 iterations"
+    yield "depth error {:.0f} and {:.0f} % larger".format(*costs)
+
+
+@pytest.mark.parametrize("topic", [iterations, harmonics])
+def test_the_page_on_fits_prints_what_was_measured(topic):
+    told = " ".join((ROOT / "docs/method/fitting.md").read_text().split())
+    assert [phrase for phrase in topic() if phrase not in told] == []
