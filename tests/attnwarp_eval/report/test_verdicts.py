@@ -153,7 +153,10 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     for k, half in enumerate((slice(0, 3), slice(3, 8))):
         store = written(tmp_path / f"run{k}", SCENES[half], factors[half], rounds=7)
         target = reports / "suite" / f"results-{k}.jsonl.xz"
-        assert invoke("report", store.root, "--raw", target, "--no-pictures").exit_code == 0
+        how = ("--raw", target, "--no-pictures", "--latex", "--csv")
+        assert invoke("report", store.root, *how).exit_code == 0
+        names = {path.name for path in (store.root / "tables").iterdir()}
+        assert {"01-calibration.tex", "01-calibration.csv"} <= names
     claims = verdicts(reports)
     (slip,) = [one for one in claims if one.comparison is not None]
     assert slip.claim.id == "half-pixel-slip"
