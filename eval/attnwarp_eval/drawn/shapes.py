@@ -67,7 +67,7 @@ def _edits(number: int, thing: Thing, shapes: Sequence[Shape], color: str) -> li
     does: dict[str, list[Entry]] = {
         "added": [
             {"name": name, "add": put(shape, "on")}
-            for name, shape in _hats(top, float(np.clip(0.5 * r, 0.14, 0.28))).items()
+            for name, shape in _hats(top, float(np.clip(0.6 * r, 0.2, 0.4))).items()
         ],
         "replaced": [
             {"name": name, "remove": thing.names, "add": put(shape, "instead")}

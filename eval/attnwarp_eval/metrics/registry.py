@@ -222,6 +222,13 @@ _SPECS = (
     Metric("parts.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the source's answers, at pixels truly seen"),
     Metric("parts.seen_parts", "pixels", "none", 0, 0, "parts truly seen by the source"),
     Metric("parts.hidden_pixels", "pixels", "none", 0, 0, "hidden pixels with another part before them"),
+    Metric("shape.same", "share", "higher", 1e-4, 0, "places that show the source's answer"),
+    Metric("shape.new", "share", "higher", 1e-4, 0, "new surface that the source sees, and that stands there with its answer"),
+    Metric("shape.uncovered", "share", "higher", 1e-4, 0, "uncovered surface that shows what the source's answer uncovers"),
+    Metric("shape.overlap", "share", "higher", 1e-4, 0, "intersection over union of silhouettes of what is new"),
+    Metric("shape.lost", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the truth on untouched surface"),
+    Metric("shape.stands", "share", "higher", 1e-4, 0, "pixels whose depth of tuned splats is within 2 % of the scene after"),
+    Metric("shape.depth", "ratio", "lower", 1e-4, 1e-3, "mean relative error of that depth"),
     # Hard cases: attnwarp_eval.stability, docs/measuring/hard-cases.md.
     Metric("stability.margin", "decades", "higher", 1e-2, 0, "log10 of tolerance over error, cut at 3 and -3"),
     Metric("stability.error", "own", "lower", 0, 1e-2, "error of a hard case, in the unit of its tolerance"),

@@ -82,11 +82,24 @@ class Grams:
     Attributes:
         matrices: (N, K, K) float64 of each part that a view shows.
         view, part: (N,) the view's number and the part.
+        row, answer: (M,) and (M, K): what is counted, such as several places of one part. Each is
+            of one of the N parts, and each of the part's answers stands for one of its own answers,
+            from 0. ``view`` and ``part`` are then (M,). None counts the parts and their answers.
     """
 
     matrices: Tensor
     view: npt.NDArray[np.int64]
     part: npt.NDArray[np.int64]
+    row: Tensor | None = None
+    answer: Tensor | None = None
+
+    def counted(self, weights: Tensor) -> Tensor:
+        """(T, M, R, A) weights of what is counted, of (T, N, R, K) weights of the parts."""
+        if self.row is None or self.answer is None:
+            return weights
+        index = self.answer[None, :, None].expand(len(weights), -1, weights.shape[2], -1)
+        sums = weights.new_zeros(*index.shape[:3], int(self.answer.max()) + 1)
+        return sums.scatter_add(3, index, weights[:, self.row])
 
     @classmethod
     def of(cls, views: Sequence[Answers]) -> Grams:
@@ -163,7 +176,7 @@ def alone(grams: Grams, share: float, steps: int, seed: int = 1) -> Alone:
         steps: number of steps of denoising.
         seed: seed of the noise.
     """
-    weights = edit_alone(grams, _starts(grams, seed), share, steps)
+    weights = grams.counted(edit_alone(grams, _starts(grams, seed), share, steps))
     answers = weights[-1].argmax(dim=-1).numpy()
     count = weights.shape[-1]
     frequencies = np.bincount(answers.ravel(), minlength=count) / answers.size

@@ -64,6 +64,7 @@ def run_method(
     donor: Donor | None = None,
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
     words: Mapping[str, str] | None = None,
+    warped_by: World | None = None,
 ) -> EditedScene:
     """Edit a scene by the method of a cell; its seconds and its work are added to the work's meter.
 
@@ -75,6 +76,7 @@ def run_method(
             editor.
         segments: (H, W) bool of each view, the only pixels that may change.
         words: ``instruction``, ``target`` and ``source``; by default the spec's entry ``edit``.
+        warped_by: world of the spec's true geometry; by default the work's.
     """
     spec, world = work.spec, work.world
     words = spec["edit"] if words is None else words
@@ -95,7 +97,7 @@ def run_method(
             words["target" if editor.guide == "depth" else "instruction"],
             with_source_words(spec["settings"], words["source"]),
             Path(folder),
-            _warps(work, before, names),
+            _warps(spec, warped_by or world, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},
             donor=donor,
             segments=segments,
@@ -185,9 +187,8 @@ def load(name: str, planned: Json, device: str = "cpu") -> Editor:
     return _loaded(name, guidance, planned.get("draws", True), device)
 
 
-def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
+def _warps(spec: Mapping[str, Any], world: World, model: Gaussians, names: Sequence[str]) -> Any:
     """Warps by exact depth, with the exact mask, or of a control; None for the method's warps."""
-    spec, world = work.spec, work.world
     control = spec.get("control")
     if control == OTHER_SCENE:  # the correct warp of wrong features
         control = None

@@ -1,0 +1,1 @@
+"""Edits that change shapes by the ideal editor."""
