@@ -4,8 +4,8 @@ by name.
 Reports of probes are defined in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
-['calibration', 'carry', 'depth', 'editing', 'fit', 'ideal', 'labels', 'masks', 'stability',
- 'timing', 'warp']
+['calibration', 'carry', 'depth', 'editing', 'fit', 'ideal', 'labels', 'masks', 'shape',
+ 'stability', 'timing', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """

@@ -138,7 +138,7 @@ def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geo
         return warp
 
     same = {0.0: [], 1.0: []}
-    for seed, weight in itertools.product(range(6), same):
+    for seed, weight in itertools.product(range(3), same):
         settings = preset(
             "attention_warping", a0=weight, decay="constant", noise="fresh", stages=1, steps=8,
             iterations=0, seed=seed,
@@ -148,6 +148,6 @@ def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geo
         again, *targets = shown(of.cameras, settings, warps(after, settings))
         assert (again == source).all()
         same[weight] += [target == source for target in targets]
-    # Of 24 draws of 4 answers, 1 to 13 agree by chance in all but 1 of 500.
-    assert 1 <= np.sum(same[0.0]) <= 13
+    # Of 12 draws of 4 answers, 8 and fewer agree by chance in all but 1 of 2,000.
+    assert np.sum(same[0.0]) <= 8
     assert np.mean(same[1.0]) >= 0.98
