@@ -13,12 +13,13 @@ from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.study.shared.warps import warp_truth
-from attnwarp_eval.truth import appearance
+from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.world import World
 from attnwarp_lab.ideal import places
 from attnwarp_lab.ideal.editor import tokens_of
 from attnwarp_lab.ideal.figures import part_answers
 from attnwarp_lab.ideal.places import Places, chosen
+from attnwarp_lab.ideal.shape_figures import ShapeTruth, depth_figures, shape_figures
 from attnwarp_lab.ideal.share import alone, solve_share
 
 one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
@@ -105,6 +106,61 @@ def test_places_whose_combinations_are_too_many_are_refused(monkeypatch):
         ValueError, match=r"added-0, added-1 meet in a view and have 4 combinations"
     ):
         Places.of_edits(of, of.cameras, of.edits, 1)
+
+
+@pytest.fixture(scope="module")
+def two_hats():
+    """The first of two hats on a ball, and another ball removed."""
+    of = scene(
+        {-0.7: [sphere(0, -0.6, 1.1, 0.35), box(0, -0.8, 1.0, 0.6, 0.9, 0.5)]}, 48, [30], [0.7]
+    )
+    made = Places.of_edits(of, of.cameras, of.edits, 2)
+    truth = ShapeTruth(of, made, np.array([0, -1]), Geometry(of))
+    return made, truth, truth.view(of.targets[0])
+
+
+def test_the_truth_has_every_figure_at_its_best_and_the_picture_before_at_its_worst(two_hats):
+    made, truth, view = two_hats
+    right, before = truth.picture("yaw030"), made.before["yaw030"]
+    best = shape_figures(right, truth, view, "yaw030", np.array([0, -1]))
+    worst = shape_figures(before, truth, view, "yaw030", np.array([1, -1]))
+    shares = {
+        f"shape.{k}" for k in ("same.added", "new.added", "overlap.added", "uncovered.removed")
+    }
+    shares |= {f"shape.{k}" for k in ("same.several", "new.several", "uncovered.one")}
+    assert {key: best[key] for key in shares} == dict.fromkeys(shares, 1.0)
+    assert {key: worst[key] for key in shares} == dict.fromkeys(shares, 0.0)
+    assert best["shape.lost"] == 0
+    far = np.where(view.untouched[..., None], 1.0, right)
+    assert shape_figures(far, truth, view, "yaw030", np.array([0, -1]))["shape.lost"] > 10
+
+
+def test_the_other_hat_is_right_only_where_both_show_the_same(two_hats):
+    made, truth, view = two_hats
+    right, other = truth.picture("yaw030"), truth.picture("yaw030").copy()
+    inside = made.labels["yaw030"] == made.part_of[0]
+    other[inside] = made.after["yaw030"][1][inside]
+    seen = view.new[0] & view.visible
+    same = (np.square(right - other).sum(-1) <= 1e-6)[seen].mean()
+    figures = shape_figures(other, truth, view, "yaw030", np.array([1, -1]))
+    assert figures["shape.new.added"] == pytest.approx(same) and same < 0.5
+    # The silhouettes of a ball and of a box, by rays.
+    ball, crate = (view.shows[0][k] for k in (0, 1))
+    assert figures["shape.overlap.added"] == (ball & crate).sum() / (ball | crate).sum()
+
+
+def test_depth_stands_where_it_is_within_two_percent_and_undefined_depth_stands_nowhere(two_hats):
+    _, truth, view = two_hats
+    exact = depth_figures(view.depth.copy(), truth, view)
+    keys = ("new.added", "gone.removed", "untouched")
+    assert [exact[f"shape.stands.{key}"] for key in keys] == [1, 1, 1]
+    off = np.where(view.new[0], 1.03 * view.depth, 1.01 * view.depth)
+    off[view.gone[1]] = np.nan
+    figures = depth_figures(off, truth, view)
+    assert [figures[f"shape.stands.{key}"] for key in keys] == [0, 0, 1]
+    assert figures["shape.depth.new"] == pytest.approx(0.03)
+    assert figures["shape.depth.untouched"] == pytest.approx(0.01)
+    assert np.isnan(figures["shape.depth.gone"])
 
 
 def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geometry_after():
