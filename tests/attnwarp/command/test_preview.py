@@ -10,6 +10,7 @@ import pytest
 from loaded_once import editors_are_loaded_once, short_orbit  # noqa: F401
 from skimage.color import deltaE_ciede2000, rgb2lab
 from tiny_editors import pix2pix
+from tiny_joint import klein_folder
 from tiny_scenes import cameras, pictures, splats
 from typer.testing import CliRunner
 
@@ -69,6 +70,18 @@ def by_seed(place):
     """The folder of the edit by seed 2."""
     assert run(place, place / "by-seed", "--seed", 2, "--no-control").exit_code == 0
     return place / "by-seed"
+
+
+@pytest.mark.parametrize("name", ["small-depth", pytest.param("klein", marks=pytest.mark.door)])
+def test_editors_of_depth_and_of_joint_attention_go_on_from_an_answer_too(name, place, tmp_path):
+    if name == "klein":
+        klein_folder(tmp_path / name)
+        name = tmp_path / name
+    given = ("--editor", name, "--no-control", "--anyway")
+    for out, more in (("own", "--preview"), ("own", "--answer=1"), ("plain", "--seed=1")):
+        result = run(place, tmp_path / out, *given, more)
+        assert result.exit_code == 0, result.output
+    assert same_edit(tmp_path / "own", tmp_path / "plain")
 
 
 def same_edit(one, two):
