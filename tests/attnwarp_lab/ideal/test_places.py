@@ -169,7 +169,7 @@ def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geo
             box(0, y, 1.25, 0.45, 0.45, 1.1), box(0, y, 0.85, 1.0, 1.1, 0.35)]
         for y in (-0.8, 0.8)
     }  # fmt: skip
-    of = scene(hats, 96, targets=(6, 12), fov=28)
+    of = scene(hats, 64, targets=(6, 12), fov=28)
     made = Places.of_edits(of, of.cameras, of.edits, 2)
     share = solve_share(made.grams, 0.4, 8)
     assert alone(made.grams, share, 8).fault() is None
@@ -187,7 +187,7 @@ def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geo
 
     def warps(after, settings):
         def warp(_, target):
-            pair = after.pair(names[target], 96)
+            pair = after.pair(names[target], 64)
             visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
             return warp_truth(after, pair, settings.warp).with_mask(visible)
 
@@ -200,7 +200,7 @@ def test_hats_differ_by_the_noise_alone_and_follow_the_source_along_the_true_geo
             iterations=0, seed=seed,
         )  # fmt: skip
         (source,) = shown(of.cameras[:1], settings)
-        after = World(chosen(of, of.edits, tuple(source)), 96)
+        after = World(chosen(of, of.edits, tuple(source)), 64)
         again, *targets = shown(of.cameras, settings, warps(after, settings))
         assert (again == source).all()
         same[weight] += [target == source for target in targets]
