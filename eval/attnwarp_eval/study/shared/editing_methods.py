@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from attnwarp.editing.recording import Recording
     from attnwarp.gaussians import Gaussians
     from attnwarp.methods import Budget, Options, Round
+    from attnwarp.methods.algorithms.attention_warping import AttentionWarping
     from attnwarp.warp import WarpedView
 
 Image = npt.NDArray[np.float32]
@@ -194,12 +195,19 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
         AttentionWarpingSettings, job.gaussians, [job.cameras[job.source]], [donor.picture],
         donor.editor, job.instruction, replace(settings, iterations=0), load=job.load,
     )  # fmt: skip
+    return run_warping(job, Swapping)
+
+
+def run_warping(job: Job, kind: type[AttentionWarping]) -> EditedScene:
+    """Edit a scene by attention warping of another class, with the settings of the job."""
+    from attnwarp.methods.base import run
+
     return _edited(
         run(
             "attention_warping",
-            lambda work, s: Swapping(work, s, job.source, None, job.warps, "cpu"),
+            lambda work, s: kind(work, s, job.source, None, job.warps, "cpu"),
             AttentionWarpingSettings, job.gaussians, job.cameras, job.images, job.editor,
-            job.instruction, settings, **job.options,
+            job.instruction, AttentionWarpingSettings.from_dict(job.settings), **job.options,
         )
     )  # fmt: skip
 
@@ -212,23 +220,23 @@ def _edited(result: Any) -> EditedScene:
     )  # fmt: skip
 
 
-def _true_pictures(job: Job) -> EditedScene:
-    """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
+def true_pictures(job: Job, base: type[AttentionWarping] | None = None) -> EditedScene:
+    """Take the first answer's true pictures in every view, and tune splats on them: the ceiling.
 
-    Stages, their views and their tuning are those of ``attention_warping``.
+    Stages, their views and their tuning are those of ``base``, by default ``attention_warping``.
 
     Raises:
         ValueError: a budget or a donor, neither of which means anything here.
     """
     from attnwarp.methods.algorithms.attention_warping import AttentionWarping
-    from attnwarp.methods.base import ViewEdit, run
+    from attnwarp.methods.base import ViewEdit
 
     for name in ("budget", "donor"):
         if getattr(job, name) is not None:
             raise ValueError(f"{name}: got one, but 'true pictures' edits nothing; leave it out")
     pictures = next(iter(job.truth.values()))
 
-    class TruePictures(AttentionWarping):
+    class TruePictures(base or AttentionWarping):  # type: ignore[misc]
         """Views become their true pictures."""
 
         def edit_source(self, *_: Any) -> list[ViewEdit]:
@@ -237,16 +245,7 @@ def _true_pictures(job: Job) -> EditedScene:
         def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
             return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
 
-    def make(work: Any, settings: Any) -> TruePictures:
-        return TruePictures(work, settings, job.source, None, None, "cpu")
-
-    result = _edited(
-        run(
-            "true pictures", make, AttentionWarpingSettings,
-            job.gaussians, job.cameras, job.images, job.editor, job.instruction,
-            AttentionWarpingSettings.from_dict(job.settings), **job.options,
-        )
-    )  # fmt: skip
+    result = run_warping(replace(job, warps=None), TruePictures)
     return replace(result, counters={**result.counters, "network_rows": 0})
 
 
@@ -305,7 +304,7 @@ EDITING_METHODS: dict[str, Method] = {
         _BY_NAME["attention_warping"], run=_attention_warping, edited=_warped_views
     ),
     "true pictures": Method(
-        _BY_NAME["attention_warping"].settings, _true_pictures, needs_truth=True
+        _BY_NAME["attention_warping"].settings, true_pictures, needs_truth=True
     ),
 }
 """Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``a0: 0`` is the

@@ -5,7 +5,7 @@ The tuning of the paper moves splats and adds none, so nothing can grow where no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,13 +18,15 @@ from attnwarp.camera import Camera
 from attnwarp.fit import Views
 from attnwarp.fit.densify import Density
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods import AttentionWarpingSettings
 from attnwarp.methods.algorithms.attention_warping import AttentionWarping
-from attnwarp.methods.base import ViewEdit, run
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.methods.tuning import Tuning
 from attnwarp.render import Render
-from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Job
+from attnwarp_eval.study.shared.editing_methods import (
+    EDITING_METHODS,
+    run_warping,
+    true_pictures,
+)
 
 UNTIL = 0.9
 """Share of the iterations until which splats are added: in every stage."""
@@ -77,39 +79,9 @@ class GrowingWarping(AttentionWarping):
     tuning = GrowingTuning
 
 
-class TrueGrowing(GrowingWarping):
-    """The same with the first answer's true pictures for edits: the ceiling."""
-
-    def __init__(self, pictures: Sequence[Any], *rest: Any) -> None:
-        self.pictures = pictures
-        super().__init__(*rest)
-
-    def edit_source(self, *_: Any) -> list[ViewEdit]:
-        """Take the source's true picture."""
-        return self.edit_targets(0, [self.source])
-
-    def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
-        """Take the true pictures of some views."""
-        return [ViewEdit(self.pictures[view], {"injected": 0.0}) for view in batch]
-
-
-def _growing(kind: Callable[..., GrowingWarping], job: Job) -> EditedScene:
-    result = run(
-        "growing",
-        lambda work, s: kind(work, s, job.source, None, job.warps, "cpu"),
-        AttentionWarpingSettings, job.gaussians, job.cameras, job.images, job.editor,
-        job.instruction, AttentionWarpingSettings.from_dict(job.settings), **job.options,
-    )  # fmt: skip
-    return EditedScene(
-        result.gaussians, result.edited, result.seconds, result.counters, result.cut, result.rounds
-    )
-
-
-def _true_growing(job: Job) -> EditedScene:
-    return _growing(partial(TrueGrowing, next(iter(job.truth.values()))), job)
-
-
-_LIKE = EDITING_METHODS["attention_warping"]
-
-EDITING_METHODS["growing"] = replace(_LIKE, run=partial(_growing, GrowingWarping))
-EDITING_METHODS["growing true pictures"] = replace(_LIKE, run=_true_growing, needs_truth=True)
+EDITING_METHODS["growing"] = replace(
+    EDITING_METHODS["attention_warping"], run=partial(run_warping, kind=GrowingWarping)
+)
+EDITING_METHODS["growing true pictures"] = replace(
+    EDITING_METHODS["true pictures"], run=partial(true_pictures, base=GrowingWarping)
+)
