@@ -82,6 +82,7 @@ def inject(
     weight: Weight,
     blend: Blend,
     warps: Sequence[LayerWarp | None] = (None,),
+    layers: Sequence[Layer] | None = None,
 ) -> Iterator[None]:
     """Blend recorded features into an editor's attention, at each layer's size, while the block
     runs. Steps and branches that were not recorded stay unchanged.
@@ -96,6 +97,7 @@ def inject(
         blend: blend of a layer's tokens; gets half precision as float32.
         warps: warps of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView`, or
             None for the identity.
+        layers: recorded layers to inject into; None for all.
 
     Raises:
         ValueError: a timestep, branch or size does not match the recording, or the recorded run had
@@ -143,5 +145,5 @@ def inject(
                 result[row] = blended(blend, at, own[None], features[row][None], a)[0]
         return result
 
-    with hooked(editor, plan.layers, change):
+    with hooked(editor, plan.layers if layers is None else layers, change):
         yield

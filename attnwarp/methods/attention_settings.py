@@ -75,7 +75,8 @@ class AttentionWarpingSettings(MethodSettings):
         a0: weight of the injected features at the first step. 0 records nothing and edits each view
             alone, with all else equal: the control.
         decay: "linear", a_t = a0 (T - t) / T; "late", a0 until the last third of the steps, in
-            which it falls to 0; or "constant".
+            which it falls to 0; "constant"; or "by_kind": constant for self-attention, falling to
+            0 within the first third for cross-attention, and "late" for all else.
         kinds: kinds of features that are warped, such as ["self"]; None for all outputs of
             attention. ["key", "value"] warps a transformer's keys, before positions turn them, and
             its values.
@@ -135,7 +136,7 @@ class AttentionWarpingSettings(MethodSettings):
     reference: Literal["none", "plain", "warped"] = "none"
     depth_from: Literal["frozen", "current"] = "frozen"
     a0: Share = 0.9
-    decay: Literal["linear", "late", "constant"] = "linear"
+    decay: Literal["linear", "late", "constant", "by_kind"] = "linear"
     kinds: tuple[Kind, ...] | None = None
     blocks: tuple[int | str, ...] | None = None
     feature_steps: tuple[float, float] = (0.0, 1.0)

@@ -27,7 +27,7 @@ from attnwarp.editing import injection
 from attnwarp.editing.editor import Editor, edit
 from attnwarp.editing.injection import TokenWarp
 from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
-from attnwarp.editing.layers import Layer
+from attnwarp.editing.layers import Kind, Layer
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.schedule import Size, Time
 from attnwarp.fit.views import to_float
@@ -122,8 +122,9 @@ def attention_warping(
     )  # fmt: skip
 
 
-def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
-    """Weight of the source's features at step t of T: a_t = a0 (T - t) / T, or as ``decay`` says.
+def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED, kind: Kind = "joint") -> float:
+    """Weight of the source's features at step t of T: a_t = a0 (T - t) / T, or as ``decay`` says
+    for a kind of features.
 
     Example:
         >>> [round(a_t(t, 4), 3) for t in range(4)]
@@ -131,6 +132,11 @@ def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
         >>> late = AttentionWarpingSettings(a0=1.0, decay="late")
         >>> [a_t(t, 6, late) for t in range(6)]
         [1.0, 1.0, 1.0, 1.0, 1.0, 0.5]
+        >>> by_kind = AttentionWarpingSettings(a0=1.0, decay="by_kind")
+        >>> [a_t(t, 6, by_kind, "self") for t in range(6)]
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+        >>> [a_t(t, 6, by_kind, "cross") for t in range(6)]
+        [1.0, 0.5, 0.0, 0.0, 0.0, 0.0]
         >>> import numpy as np
         >>> from attnwarp.editing.editor import edit
         >>> from attnwarp.editing.recording import RecordingPlan, record
@@ -145,7 +151,9 @@ def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
         True
     """
     falling = s.a0 * (T - t) / T
-    return {"linear": falling, "late": min(s.a0, 3 * falling), "constant": s.a0}[s.decay]
+    late, early = min(s.a0, 3 * falling), max(0.0, s.a0 - 3 * (s.a0 - falling))
+    by_kind = {"self": s.a0, "cross": early}.get(kind, late)
+    return {"linear": falling, "late": late, "constant": s.a0, "by_kind": by_kind}[s.decay]
 
 
 def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
@@ -274,10 +282,14 @@ class AttentionWarping(Method):
             self.attend(stack, batch, warps)
             if source.recording is not None:
                 layers = [self.of_features(warp) for warp in warps]
-                weight = partial(a_t, s=s)
-                stack.enter_context(
-                    inject(work.editor, source.recording, warps=layers, weight=weight)
-                )
+                for kind in {layer.kind for layer in self.features.layers}:
+                    same = [layer for layer in self.features.layers if layer.kind == kind]
+                    weight = partial(a_t, s=s, kind=kind)
+                    stack.enter_context(
+                        inject(
+                            work.editor, source.recording, warps=layers, layers=same, weight=weight
+                        )
+                    )
             pictures = self.denoise(start, warps, step)
         return [
             self.result(view, picture, warp)

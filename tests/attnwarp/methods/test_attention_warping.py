@@ -1081,6 +1081,48 @@ def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     assert np.abs(some.edited[1] / 255 - expected).max() < 0.5 / 255 + 1e-4
 
 
+def test_each_kind_of_attention_is_carried_by_a_course_of_its_own(scene, editor):
+    """Oracle: a loop that blends each layer's output itself, at the source's place."""
+    settings = replace(ONE, steps=4, a0=0.8, decay="by_kind", batch=1)
+    model, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    identity = warp_surfaces(views[0], views[0], FLAT, FLAT)
+    pair = model, [views[0], twin], [images[0], images[1]]
+    result = run(pair, editor, settings=settings, warps=lambda source, target: identity)
+    kept = {}
+    branches = [k for k, name in enumerate(editor.branches) if name in editor.carries]
+
+    def edited(image, change):
+        calls = dict.fromkeys((layer.name for layer in editor.layers()), 0)
+
+        def hook(name, module, args, out):
+            step, calls[name] = calls[name], calls[name] + 1
+            return change(name, step, out)
+
+        handles = [
+            editor.unet.get_submodule(name).register_forward_hook(functools.partial(hook, name))
+            for name in calls
+        ]
+        picture = edit(editor, [image], "a bear", steps=4).images[0]
+        for handle in handles:
+            handle.remove()
+        return picture
+
+    def keep(name, step, out):
+        kept[name, step] = out.clone()
+
+    def carry(name, step, out):
+        weight = 0.8 if name.endswith("attn1") else (0.8, 0.2, 0, 0)[step]
+        out = out.clone()
+        for row in branches:
+            out[row] = (1 - weight) * out[row] + weight * kept[name, step][row]
+        return out
+
+    edited(images[0], keep)
+    expected = edited(images[1], carry)
+    assert np.abs(result.edited[1] / 255 - expected).max() < 0.5 / 255 + 1e-4
+
+
 def test_an_edit_with_features_of_chosen_steps_is_written_and_resumed(
     finished, scene, editor, tmp_path
 ):
