@@ -30,13 +30,13 @@ from torch import Tensor
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from attnwarp.editing.editor import Defaults, Guide, Image, tensor_of
-from attnwarp.editing.layers import Call, Layer, unet_call
+from attnwarp.editing.layers import Call, Kind, Layer, unet_call
 from attnwarp.editing.schedule import DDIM, Size, Time, stable_diffusion_alphas
 
 FACTOR = 4
 """Pixels along the side of a token, as of the bundled editors."""
 
-Cross = Literal["paint", "word"]
+Cross = Literal["paint", "word", "swapped"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,8 @@ class IdealUNet(torch.nn.Module):
     Args:
         views: views of one size, with the same number of answers.
         alphas: (N,) alpha-bar of the steps.
-        cross: output of cross-attention, "paint" or "word".
+        cross: output of cross-attention, "paint" or "word"; "swapped" calls the layer that paints
+            self-attention and the other one cross-attention.
     """
 
     before: Tensor
@@ -127,7 +128,7 @@ class IdealUNet(torch.nn.Module):
             w = self.cross_attention(torch.where(inside, w, 0.0))
         u = torch.einsum("bnk,bknc->bnc", w, self.change[rows])
         u = torch.where(inside, u, 0.0)
-        if self.cross == "paint":
+        if self.cross != "word":
             u = self.cross_attention(u)
         clean = self.before[rows] + u
         return clean.transpose(1, 2).unflatten(2, sample.shape[2:])
@@ -254,9 +255,11 @@ class IdealEditor(Defaults):
     def layers(self) -> tuple[Layer, ...]:
         """The two layers of attention."""
         count, channels = self.unet.change.shape[1], self.unet.change.shape[-1]
+        kinds: list[Kind] = ["self", "cross"]
+        choice, paint = reversed(kinds) if self.unet.cross == "swapped" else kinds
         return (
-            Layer("self_attention", "self", 0, count),
-            Layer("cross_attention", "cross", 0, channels if self.unet.cross == "paint" else count),
+            Layer("self_attention", choice, 0, count),
+            Layer("cross_attention", paint, 0, count if self.unet.cross == "word" else channels),
         )
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:

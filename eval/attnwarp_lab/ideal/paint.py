@@ -25,10 +25,10 @@ def answer_colors(count: int) -> list[str]:
     """Colours as #rrggbb, their hues at equal angles.
 
     Args:
-        count: at least 2.
+        count: at least 1.
 
     Raises:
-        ValueError: fewer than 2.
+        ValueError: fewer than 1.
 
     Example:
         >>> answer_colors(2)
@@ -36,8 +36,8 @@ def answer_colors(count: int) -> list[str]:
     """
     from skimage.color import lab2rgb
 
-    if count < 2:
-        raise ValueError(f"colors: got {count}, expected at least 2")
+    if count < 1:
+        raise ValueError(f"colors: got {count}, expected at least 1")
     colors = []
     for k in range(count):
         angle = math.tau * (k + 0.5) / count

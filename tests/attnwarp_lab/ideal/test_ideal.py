@@ -44,7 +44,7 @@ def view(parts, answers=3, seed=0):
 
 
 @pytest.mark.parametrize("parts", [[0, 0, -1, 0, 0, -1, 0, 0, 0], [0, 1, -1, 1, 0, 1, 1, 0, 0]])
-@pytest.mark.parametrize("cross", ["paint", "word"])
+@pytest.mark.parametrize("cross", ["paint", "word", "swapped"])
 def test_the_prediction_is_the_posterior_mean_over_all_pictures(parts, cross):
     own, share, timestep = view(parts), 0.02, 640
     editor = IdealEditor([own], share, cross)

@@ -43,9 +43,9 @@ class IdealPart(Part):
     """
 
     parts: Annotated[Whole, Field(ge=1, le=1000)] = 12
-    colors: Annotated[Whole, Field(ge=2, le=12)] = 4
+    colors: Annotated[Whole, Field(ge=1, le=12)] = 4
     settled: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    cross: Literal["paint", "word", "joint"] = "paint"
+    cross: Literal["paint", "word", "swapped", "joint"] = "paint"
 
 
 class EditorPart(Part):
