@@ -266,7 +266,7 @@ PRESETS: dict[str, MethodSettings] = {
         warp=WARPS["tolerant"],
         unseen="attend",
         a0=1.0,
-        decay="late",
+        decay="by_kind",
     ),
 }
 """Presets by name, the default first; see :data:`attnwarp.methods.PRESETS`."""

@@ -13,6 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[3]
 README = " ".join((ROOT / "README.md").read_text().split())
+COLOR = ("ideal", "parts.delta_e.edit")
 SEEN, KEPT = ("ideal", "parts.seen.edit"), ("warp", "occlusion.recall")
 ANSWER = ("editing", "multiview.same_answer.edit")
 APART = ("editing", "multiview.delta_e_above.edit_inside")
@@ -23,6 +24,10 @@ SENTENCES = [
     ("fitted/undensified", SEEN, ["2DGS fit, each view alone"], "each view alone {:.0%}, `extended` with exact"),
     ("fitted/undensified", SEEN, ["exact depth and mask"], "depth and mask {:.0%} (24 scenes"),
     ("fitted/undensified", KEPT, ["2DGS fit, tolerant", "2DGS fit"], "mask keeps {:.0%} of what is visible there, that of `corrected` {:.0%}"),
+    ("kinds", SEEN, ["by kind", "both late", "each view alone"], "It brings {:.0%} of these parts to the source's answer, its former weights {:.0%}, each view alone {:.0%}"),
+    ("kinds", COLOR, ["by kind", "both late"], "colours are off by {:.1f} for {:.1f} dE00"),
+    ("kinds", COLOR, ["one answer: by kind", "one answer: both late"], "views are {:.2f} dE00 from it, as each view alone, for {:.2f} before"),
+    ("kinds", ("ideal", "parts.through.edit"), ["by kind", "both late"], "does not see {:.0%} show what stands before it, for {:.0%}"),
     ("ablation", ANSWER, ["shared: corrected"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
     ("ablation", ANSWER, ["shared: each view alone"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
     ("ablation", APART, ["shared: each view alone", "shared: corrected"], "differ more alone, by {:.1f} for {:.1f} dE00"),
@@ -64,6 +69,9 @@ def means():
     edited = by_scene("ablation", *ANSWER, "shared: corrected")
     every = {one["cell"]["scene"] for one in cells("ablation")}
     yield f"over the {len(edited)} of {len(every)} scenes whose source was edited"
+    alone = by_scene("kinds", *COLOR, "one answer: each view alone")
+    assert round(np.mean([*alone.values()]), 2) == 0.20
+    yield f"[{len(alone)} scenes](reports/kinds/report.md)"
 
 
 def drifts():
@@ -287,13 +295,12 @@ def other_meshes():
 
 def edits():
     """Rows on edits."""
-    shares = in_page(
-        "README.md",
-        r"its weights and its mask together, brings [^|]*\|[^|]*\|[^|]*\| (\d+ %) against (\d+ %)",
-    )
-    yield "`extended` brings {} of the parts that the source shows to its answer, `corrected` {}.".format(
+    shares = [
+        np.mean([*by_scene("kinds", *SEEN, each).values()]) for each in ("by kind", "both late")
+    ]
+    yield "early bring {:.0%} of the parts to the source's answer, both late {:.0%}".format(
         *shares
-    )
+    ).replace("%", " %")
     yield f"[at {lines('ideal-256')[0]['study']['size']} px](ideal-256/report.md)"
     edge, exact = (
         in_page("depth-edges/report.md", rf"\| {name} \| [^|]* \| [^|]* \| -(\d+) points")[0]
