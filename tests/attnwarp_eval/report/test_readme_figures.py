@@ -10,6 +10,7 @@ from statistics import median
 
 import numpy as np
 import pytest
+from scipy import stats
 
 ROOT = Path(__file__).parents[3]
 README = " ".join((ROOT / "README.md").read_text().split())
@@ -246,7 +247,6 @@ def masks_and_fits():
     fits = lines("iterations")[0]["study"]["variants"]
     few, most = (f(one["fit"]["iterations"] for one in fits.values()) for f in (min, max))
     yield f"What {few} to {most:,} iterations of a fit give"
-    yield "of which few have 7,000"
     yield f"labels and pictures, on {scenes_of('iterations')} drawn scenes"
     yield f"lets more through, on {scenes_of('rules')} drawn scenes"
     (up,) = in_page("labels/report.md", r"\| exact depth \| labels.net \| \+(\S+) points")
@@ -377,30 +377,27 @@ def test_there_are_at_most_25_reports_a_row_is_one_sentence_and_each_link_is_the
 
 
 def iterations():
-    """CPU seconds and depth error, over the scenes that have them all."""
-    seconds = defaultdict(dict)
+    """CPU seconds and depth errors, over the scenes that have all four numbers of iterations."""
+    names, seconds = ("300", "1,000", "3,000", "7,000"), defaultdict(dict)
     for one in cells("iterations"):
         if one["cell"]["probe"] == "fit":
             point = one["record"]["curve"][-1]
             seconds[one["cell"]["variants"][0]][one["cell"]["scene"]] = point["cpu_seconds"]
-
-    def told(*variants):
-        scenes = set.intersection(*(set(seconds[each]) for each in variants))
-        depth = [by_scene("iterations", "fit", "depth.abs_rel", each) for each in variants]
-        return (
-            len(scenes),
-            *(np.mean([seconds[each][scene] for scene in scenes]) for each in variants),
-            *(100 * np.mean([each[scene] for scene in scenes]) for each in depth),
-        )
-
+    scenes = sorted(set.intersection(*(set(seconds[name]) for name in names)))
+    depth = {name: by_scene("iterations", "fit", "depth.abs_rel", name) for name in names}
+    taken, left = (
+        [np.mean([figures[name][scene] for scene in scenes]) for name in names]
+        for figures in (seconds, depth)
+    )
     yield (
-        "on {} drawn scenes of 128 px, 300, 1,000 and 3,000 iterations take {:.0f}, {:.0f} and {:.0f}"
-        " CPU seconds and leave a depth error of {:.1f}, {:.1f} and {:.1f} %"
-    ).format(*told("300", "1,000", "3,000"))
-    yield (
-        "On the {0} that have 7,000, these take {2:.0f} CPU seconds for {1:.0f} of 3,000, and leave"
-        " {4:.1f} % for {3:.1f} %"
-    ).format(*told("3,000", "7,000"))
+        f"on {len(scenes)} drawn scenes of 128 px, 300, 1,000, 3,000 and 7,000 iterations take"
+        " {:.0f}, {:.0f}, {:.0f} and {:.0f} CPU seconds and leave a depth error of"
+        " {:.1f}, {:.1f}, {:.1f} and {:.1f} %"
+    ).format(*taken, *(100 * each for each in left))
+    ratios = [np.log(depth["3,000"][scene] / depth["7,000"][scene]) for scene in scenes]
+    half = stats.t.ppf(0.975, len(ratios) - 1) * stats.sem(ratios)
+    more = [100 * np.expm1(np.mean(ratios) + part) for part in (0, -half, half)]
+    yield "that of 3,000 is larger by {:.0f} % ({:.0f} to {:.0f} %)".format(*more)
 
 
 def harmonics():
