@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from torch.nn import functional
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Image, edit
 from attnwarp.editing.latents import BLOCK
+from attnwarp.editing.layers import Kind
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.io.file import write_atomically
 from attnwarp.methods.algorithms.attention_warping import AttentionWarpingSettings, a_t, inject
@@ -38,8 +40,12 @@ LEAST_PIXELS = 32
 DIFFER = 10.0
 """CIEDE2000 from which two colours differ."""
 
-CARRIED = partial(a_t, s=AttentionWarpingSettings(a0=1.0, decay="late"))
-"""Weight of the default of an edit."""
+KINDS: tuple[Kind, ...] = ("self", "cross")
+
+LATE, BY_KIND = (
+    AttentionWarpingSettings(a0=1.0, decay="late"), AttentionWarpingSettings(a0=1.0, decay="by_kind")
+)  # fmt: skip
+"""Weights of both kinds alike, and of an edit's default."""
 
 EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
@@ -254,16 +260,25 @@ def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = 
     other = {"alone": run(targets, noise_t)} if carried else {}
     if carried:
         for kind in ("self", "cross", "both"):
-            kinds = ("self", "cross") if kind == "both" else (kind,)
+            kinds = KINDS if kind == "both" else (kind,)
             chosen = replace(
                 recording,
                 plan=replace(plan, layers=tuple(one for one in plan.layers if one.kind in kinds)),
             )
-            with inject(editor, chosen, warps=[None] * len(sources), weight=CARRIED):
+            with inject(editor, chosen, warps=[None] * len(sources), weight=partial(a_t, s=LATE)):
                 same[kind] = run(sources, noise_b)
         warps = [cases.warp(c) for c in targets]
-        for key, used in (("warped", warps), ("mirrored", [Mirrored(w) for w in warps])):
-            with inject(editor, recording, warps=used, weight=CARRIED):
+        mirrored = [Mirrored(w) for w in warps]
+        for key, used, settings in (
+            ("both late", warps, LATE), ("by kind", warps, BY_KIND), ("mirrored", mirrored, BY_KIND)
+        ):  # fmt: skip
+            with ExitStack() as stack:
+                for kind in KINDS:
+                    layers = [one for one in plan.layers if one.kind == kind]
+                    weight = partial(a_t, s=settings, kind=kind)
+                    stack.enter_context(
+                        inject(editor, recording, warps=used, weight=weight, layers=layers)
+                    )
                 other[key] = run(targets, noise_t)
     for k, c in enumerate(sources):
         outside = cases.masks[c][0]
