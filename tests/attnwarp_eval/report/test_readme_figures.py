@@ -401,7 +401,7 @@ def iterations():
 
 
 def harmonics():
-    """What a later degree of the harmonics saves and costs."""
+    """Savings and costs of a later degree of the harmonics."""
     rows = [json.loads(line) for line in page("iterations/harmonics.jsonl").splitlines()]
 
     def ratio(figure, scene):
