@@ -85,5 +85,5 @@ class ShapeReport(ProbeReport):
         for kind in KINDS:
             columns = {title: metric.format(kind) for title, metric in BY_KIND.items()}
             rows = [[n, *mean_values(results, self.name, n, columns.values())] for n in names]
-            tables.append(Table([kind, *columns], rows))
+            tables.append(Table([kind, *columns], rows, folded=True))
         yield Section("Kinds of edits", [TOLD], tables)
