@@ -143,13 +143,13 @@ def shape_figures(
         shown: (P,) answers of the view.
 
     Returns:
-        By kind of a place whose answer the source tells, and for all places with ``several``
-        answers and with ``one``, ``shape.same``: 1 where the view tells
-        the same answer, else 0, for places of several answers; ``shape.new``: share of the new
-        surface that the source sees which stands there with the source's answer;
-        ``shape.uncovered``: the same of the uncovered surface, whatever the source sees;
-        ``shape.overlap``: intersection over union of the place's silhouette with the true one. And
-        ``shape.lost``: mean CIEDE2000 to the truth on untouched surface.
+        Shares by kind of a place whose answer the source tells, and of all places with ``several``
+        answers and with ``one``. ``shape.same``: 1 where the view tells the same answer, else 0,
+        for places of several answers; ``shape.new``: share of the new surface that the source sees
+        which stands there with the source's answer; ``shape.uncovered``: the same of the uncovered
+        surface, whatever the source sees; ``shape.overlap``: intersection over union of the
+        place's silhouette with the true one. And ``shape.lost``: mean CIEDE2000 to the truth on
+        untouched surface.
     """
     places = truth.places
     after, before = places.after[name], places.before[name]

@@ -74,7 +74,7 @@ class ShapeResult:
         settled, frequencies, agreement: those of places edited alone,
             :class:`attnwarp_lab.ideal.share.Alone`.
         fault: reason why the editor is not ideal; None if it is ideal.
-        answers: of each place in the source's edit, -1 where it tells none.
+        answers: answers of the places in the source's edit, -1 where it tells none.
         splats: numbers of splats before and after.
     """
 
