@@ -25,7 +25,7 @@ def hard(level):
     return case.measure(level, way) / case.bounds["forward"].at(level)
 
 
-def halved(t, T, s):
+def halved(t, T, s, kind=None):
     return s.a0 / 2
 
 

@@ -151,7 +151,7 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path, monk
     assert told.track == result.SAME and told.seconds > 0
     assert (
         told.name == "attention_warping, extended, surface noise"
-        and told.settings["decay"] == "late"
+        and told.settings["decay"] == "by_kind"
     )
     for wrong, said in (
         (["foo"], "one of"),
