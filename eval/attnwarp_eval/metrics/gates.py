@@ -58,6 +58,12 @@ GATES: Mapping[str, Margin] = {
     "parts.through": Margin(0.1),
     "parts.bleed": Margin(0.05, 0.05),
     "parts.delta_e": Margin(0.5, 0.1),
+    "shape.same": Margin(0.1),
+    "shape.new": Margin(0.1),
+    "shape.uncovered": Margin(0.1),
+    "shape.overlap": Margin(0.1),
+    "shape.stands": Margin(0.1),
+    "shape.lost": Margin(0.5, 0.1),
     "fit.mse": Margin(1e-5, 0.05),
     "fit.ssim": Margin(2e-3),
     "depth.abs_rel": Margin(1e-4, 0.05),
@@ -87,10 +93,11 @@ squared error where both sides have that; 0.2 dB are 5 % of it.
 
 EDITED = frozenset(
     (*(kind + of for kind in ("edit", "render") for of in ("", "_inside", "_next", "_seen")),
-     "edit_render", "after", "seen", "unseen")
+     "edit_render", "after", "seen", "unseen", "several", "one", "new", "gone", "untouched")
 )  # fmt: skip
 """Endings of a metric's name for edits: edited views, renders of edited splats, their edited
-object, their neighbours, pixels visible in the source; for a lifted mask also the invisible ones.
+object, their neighbours, pixels visible in the source; for a lifted mask also the invisible ones;
+for changed shapes their number of right answers, and surface that is new, gone or neither.
 """
 
 
@@ -132,10 +139,12 @@ def gated(key: str) -> bool:
         >>> gated("depth.abs_rel.edge"), gated("depth.abs_rel.after")
         (False, True)
     """
-    if key in METRICS:
-        return key in GATES
-    base, _, tail = key.rpartition(".")
-    return base in GATES and (tail.isdecimal() or tail in EDITED)
+    base = key
+    while base not in METRICS:
+        base, _, tail = base.rpartition(".")
+        if not (tail.isdecimal() or tail in EDITED):
+            return False
+    return base in GATES
 
 
 def margin(key: str) -> Margin:
