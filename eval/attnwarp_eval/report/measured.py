@@ -138,9 +138,12 @@ def regime(results: Results, table: Table) -> str:
 def _digests(records: Sequence[Record[Any]]) -> Iterator[str]:
     """Sentences on the editors and encoders, by the beginning of their SHA-256."""
     editors = {
-        f"the ideal editor ({', '.join(f'{k} {v}' for k, v in one['ideal'].items())})"
-        if "ideal" in one
-        else f"SHA-256 {one['sha256'][:12]}"
+        f"SHA-256 {one['sha256'][:12]}"
+        if "sha256" in one
+        else " and ".join(
+            f"the {kind} editor ({', '.join(f'{k} {v}' for k, v in settings.items())})"
+            for kind, settings in one.items()
+        )
         for record in records
         if (one := record.spec.get("editor"))
     }
