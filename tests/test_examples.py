@@ -126,7 +126,9 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
 
 
 NAMES = {
-    "docs/truth/scenes.md": """
+    "docs/truth/scenes.md": f"""
+import shutil
+shutil.copy({str(ROOT / "docs/truth/shapes.yaml")!r}, ".")
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.edits import edit_mask
