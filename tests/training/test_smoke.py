@@ -5,12 +5,11 @@ networks that were trained, a run that was not stopped.
 import numpy as np
 import pytest
 import torch
-from diffusers import StableDiffusionControlNetPipeline, StableDiffusionInstructPix2PixPipeline
+from diffusers import StableDiffusionInstructPix2PixPipeline
 from small_trainings import stopped_at
 from typer.testing import CliRunner
 
 from attnwarp.editing.editor import edit
-from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.small import load_editor
 from attnwarp.encoders import bundled
 from attnwarp.encoders.nets import ClipParts, ClipSmall, PerceptualSmall
@@ -21,8 +20,7 @@ from attnwarp_eval.encoders import dino_small
 from training import steps
 from training.editors import draws
 from training.editors.__main__ import app
-from training.editors.depth import DepthStage, PromptPool, train_depth_stage
-from training.editors.export import export_depth_editor, export_editor
+from training.editors.export import export_editor
 from training.editors.pool import PairPool
 from training.editors.recipe import Stage, make_tokenizer, train_stage
 from training.encoders import clip, clip_parts, dino, naming, perceptual
@@ -42,22 +40,18 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWa
 def worlds():
     """Two worlds with the looks of real ones, each a square of one colour before a slope."""
     drawn = [edit_looks(index, PAIR_SPLITS["edit-test"]) for index in range(2)]
-    looks = [[(k.finish, k.color, k.second, k.ground, k.time) for k in one] for one, _, _ in drawn]
+    looks = [[(k.finish, k.color, k.second, k.ground, k.time) for k in one] for one, _ in drawn]
     images = np.zeros((2, 2, LOOKS, SIZE, SIZE, 3), np.uint8)
     ids = np.ones((2, 2, SIZE, SIZE), np.uint8)
-    depth = np.broadcast_to(np.linspace(9, 3, SIZE)[:, None], (2, 2, SIZE, SIZE)).copy()
     for world, low in enumerate((16, 48)):
         ids[world, :, low : low + 56, low : low + 56] = THING
-        depth[world, :, low : low + 56, low : low + 56] = 2
         for look in range(LOOKS):
             rng = np.random.default_rng([world, look])
             images[world, :, look] = rng.integers(0, 256, 3)
             images[world, :, look, low : low + 56, low : low + 56] = rng.integers(0, 256, 3)
-    matrices = np.broadcast_to(np.eye(4), (2, 2, 4, 4))
     return Worlds(
-        images, np.array([valid for _, valid, _ in drawn]), np.arange(2), np.array(looks),
-        np.array([base for _, _, base in drawn]), ids, depth.astype(np.float32), matrices[..., :3, :3], matrices,
-    )  # fmt: skip
+        images, np.array([valid for _, valid in drawn]), np.arange(2), np.array(looks), ids
+    )
 
 
 @pytest.fixture
@@ -115,32 +109,11 @@ def test_small_plain_is_trained_stopped_gone_on_with_and_edits_in_diffusers(
     assert np.abs(mine - theirs).max() < 1e-6
 
 
-def test_small_depth_is_trained_and_draws_in_diffusers(out, worlds):
-    tokenizer = tokenizer_in(out)
-    pool = PairPool(worlds, tokenizer, sentences=4)
-    train_stage("plain", out, out, stage=Stage(64, 1, 1e-3, 2, batch=2, draws=False), pool=pool)
-    stage = DepthStage(64, 2, 1e-3, 2, start="plain", batch=2)
-    train_depth_stage("depth", out, out, stage=stage, pool=PromptPool(worlds, tokenizer, prompts=4))
-    folder = export_depth_editor("depth", out, out / "small-depth")
-    pipe = StableDiffusionControlNetPipeline.from_pretrained(folder, torch_dtype=torch.float32)
-    pipe.set_progress_bar_config(disable=True)
-    ours = load_editor(str(folder), text_guidance=2.0)
-    depth = worlds.depth[0, 0, ::2, ::2]
-    noise = torch.randn((1, 48, 16, 16), generator=torch.Generator().manual_seed(0))
-    control = torch.from_numpy(control_image(depth)).permute(2, 0, 1)[None]
-    theirs = pipe(
-        "a red ball on grass", image=control, height=64, width=64, num_inference_steps=4, guidance_scale=2.0,
-        latents=noise, output_type="np",
-    ).images[0]  # fmt: skip
-    picture = edit(ours, [depth], "a red ball on grass", steps=4, noise=noise).images[0]
-    np.testing.assert_allclose(picture, theirs, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["train", "plain", "--device", "tpu"], "expected cpu or cuda"),
-        (["train", "drawn-64"], "expected one of plain, drawn, depth"),
+        (["train", "drawn-64"], "expected one of plain, drawn"),
     ],
 )
 def test_an_unknown_stage_or_device_is_refused_by_name(words, reason):

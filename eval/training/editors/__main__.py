@@ -37,39 +37,35 @@ def train(
     stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1,
     device: Annotated[str, typer.Option(help="Of torch: cpu or cuda.")] = "cpu",
 ) -> None:  # fmt: skip
-    """Train a stage: plain, drawn, depth. On a GPU each takes minutes, on a CPU days."""
+    """Train a stage: plain, drawn. On a GPU each takes minutes, on a CPU days."""
     import torch
 
     if device not in ("cpu", "cuda"):
         raise typer.BadParameter(f"got {device!r}, expected cpu or cuda", param_hint="--device")
     if device == "cuda" and not torch.cuda.is_available():
         raise typer.BadParameter("torch finds no GPU here; use cpu", param_hint="--device")
-    from training.editors.depth import DEPTH_STAGES, train_depth_stage
     from training.editors.recipe import train_stage
 
-    trainer = train_depth_stage if checked(stage) in DEPTH_STAGES else train_stage
-    trainer(stage, data, out, threads=threads, device=device)
+    train_stage(checked(stage), data, out, threads=threads, device=device)
 
 
 def checked(stage: str) -> str:
     """The stage's name. BadParameter: there is none of that name."""
-    from training.editors.depth import DEPTH_STAGES
     from training.editors.recipe import STAGES
 
-    if stage not in (*STAGES, *DEPTH_STAGES):
-        names = ", ".join([*STAGES, *DEPTH_STAGES])
-        raise typer.BadParameter(f"got {stage!r}, expected one of {names}", param_hint="STAGE")
+    if stage not in STAGES:
+        raise typer.BadParameter(
+            f"got {stage!r}, expected one of {', '.join(STAGES)}", param_hint="STAGE"
+        )
     return stage
 
 
 @app.command()
 def export(stage: str, name: str, out: Out = CACHE, weights: Cards = WEIGHTS) -> None:
     """Write a stage's editor, as far as it has come, into the package under a name such as small-plain."""
-    from training.editors.depth import DEPTH_STAGES
-    from training.editors.export import export_depth_editor, export_editor
+    from training.editors.export import export_editor
 
-    write = export_depth_editor if checked(stage) in DEPTH_STAGES else export_editor
-    typer.echo(write(stage, out, weights / name))
+    typer.echo(export_editor(checked(stage), out, weights / name))
 
 
 if __name__ == "__main__":

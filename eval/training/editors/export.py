@@ -11,7 +11,6 @@ from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import SUMS
-from training.editors.depth import DEPTH_STAGES, DepthNet
 from training.editors.net import TOKENS, EditorNet, scheduler
 from training.editors.recipe import STAGES, tokenizer_of, weights_of
 
@@ -31,25 +30,11 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
     return _write(folder, _averaged(net, stage, out), tokenizer, pipeline, parts, plan.shift)
 
 
-def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
-    """Write a stage of :mod:`training.editors.depth` to ``folder``, as :func:`export_editor` does."""
-    tokenizer = tokenizer_of(out)
-    net = _averaged(
-        DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size), stage, out
-    ).half()
-    net.controlnet.save_pretrained(folder / "controlnet")
-    parts = {
-        "unet": ["diffusers", "UNet2DConditionModel"],
-        "controlnet": ["diffusers", "ControlNetModel"],
-    }
-    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts, 1)
-
-
 def _write(
     folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]],
     shift: float,
 ) -> Path:  # fmt: skip
-    """Write what both kinds have, the list of all parts and their checksums."""
+    """Write an editor's folder with the list of its parts and their checksums."""
     from transformers import PreTrainedTokenizerFast
 
     net.half()

@@ -114,29 +114,21 @@ def is_part(thing: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Worlds:
-    """Pictures of a split in memory, and the geometry behind them.
+    """Pictures of a split in memory, and what they show.
 
     Attributes:
         images: (N, 2, LOOKS, S, S, 3) uint8 sRGB.
         valid: (N, LOOKS) bool; a colour kept from training for a thing has no picture.
         things: (N,) what edits change, see :func:`thing_of`.
         looks: (N, LOOKS, 5): finish, color, second, ground, time of each look.
-        base: (N,) which of the surfaces the grounds and times of the world are shown with.
         ids: (N, 2, 128, 128) uint8, what each pixel shows.
-        depth: (N, 2, 128, 128) float32 along the optical axis, NaN where there is none.
-        K: (N, 2, 3, 3) intrinsics at 128 px.
-        world_to_camera: (N, 2, 4, 4).
     """
 
     images: npt.NDArray[np.uint8]
     valid: npt.NDArray[np.bool_]
     things: npt.NDArray[np.int64]
     looks: npt.NDArray[np.int64]
-    base: npt.NDArray[np.int64]
     ids: npt.NDArray[np.uint8]
-    depth: npt.NDArray[np.float32]
-    K: npt.NDArray[np.float64]
-    world_to_camera: npt.NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -163,8 +155,8 @@ def edit_world(index: int, split: PairSplit) -> World:
     return world if split.test else replace(world, instance=TRAIN_SHAPES + index)
 
 
-def edit_looks(index: int, split: PairSplit) -> tuple[list[Look], npt.NDArray[np.bool_], int]:
-    """The looks of a world, which of them may be shown, and which surface the grounds and times have."""
+def edit_looks(index: int, split: PairSplit) -> tuple[list[Look], npt.NDArray[np.bool_]]:
+    """The looks of a world, and which of them may be shown."""
     world = edit_world(index, split)
     thing = thing_of(world)
     rng = np.random.default_rng([split.first + index, 8])
@@ -196,7 +188,7 @@ def edit_looks(index: int, split: PairSplit) -> tuple[list[Look], npt.NDArray[np
     looks += [replace(before, ground=k) for k in range(len(GROUNDS))]
     looks += [replace(before, time=k) for k in range(len(TIMES))]
     valid = ~np.array([*unseen, *[False] * (LOOKS - SURFACES)])
-    return looks, valid, base
+    return looks, valid
 
 
 def render_edit_world(index: int, split: PairSplit) -> dict[str, Any]:
@@ -204,23 +196,19 @@ def render_edit_world(index: int, split: PairSplit) -> dict[str, Any]:
     from training.worlds.render import pictures
 
     world = edit_world(index, split)
-    looks, valid, base = edit_looks(index, split)
+    looks, valid = edit_looks(index, split)
     valid_looks = np.flatnonzero(valid)
     images = np.zeros((VIEWS, LOOKS, SIZE, SIZE, 3), dtype=np.uint8)
-    ids, depth = [], []
-    cameras = world.scene(looks[base], SIZE).cameras
+    ids = []
     for view in range(VIEWS):
         made, hits = pictures(world, [looks[k] for k in valid_looks], SIZE, view=view)
         images[view, valid_looks] = np.stack(made)
         objects = shown_things(hits.object_id, world)
         ids.append(np.where(hits.valid, objects, SKY).astype(np.uint8))
-        depth.append(hits.depth.astype(np.float32))
     return {
-        "images": images, "valid": valid, "things": np.int64(thing_of(world)), "base": np.int64(base),
+        "images": images, "valid": valid, "things": np.int64(thing_of(world)),
         "looks": np.array([(k.finish, k.color, k.second, k.ground, k.time) for k in looks]),
-        "ids": np.stack(ids), "depth": np.stack(depth),
-        "K": np.stack([cameras[v].K for v in range(VIEWS)]),
-        "world_to_camera": np.stack([cameras[v].world_to_camera for v in range(VIEWS)]),
+        "ids": np.stack(ids),
     }  # fmt: skip
 
 
@@ -253,11 +241,6 @@ def make_pairs(
     return render_missing(f"pictures: {name}", files, functools.partial(_make, name=name), workers)
 
 
-def load_pairs(folder: Path, name: str, *, count: int | None = None, workers: int = 1) -> Worlds:
-    """The first ``count`` worlds of a split (all if left out), rendered where they are missing."""
-    return load_mixed(folder, {name: count}, workers=workers)
-
-
 def load_mixed(folder: Path, counts: Mapping[str, int | None], *, workers: int = 1) -> Worlds:
     """The first worlds of several splits, one split after the other; None takes all of one."""
     paths = [
@@ -280,19 +263,16 @@ def load_mixed(folder: Path, counts: Mapping[str, int | None], *, workers: int =
 # Instructions ---------------------------------------------------------------------------------------------------------
 
 
-def scene_edits() -> list[dict[str, Any]]:
-    """Edits of the package's scenes: no recipe may learn from one."""
+@functools.cache
+def reserved() -> frozenset[str]:
+    """Instructions of the package's scenes, in lower case: no recipe may learn from one."""
     import attnwarp_eval
 
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
     scenes = [read_yaml(path.read_text())[1] for path in sorted(folder.glob("*.yaml"))]
-    return [edit for scene in scenes for edit in scene.get("edits", ())]
-
-
-@functools.cache
-def reserved() -> frozenset[str]:
-    """Instructions of the package's scenes, in lower case."""
-    return frozenset(edit["instruction"].lower() for edit in scene_edits())
+    return frozenset(
+        edit["instruction"].lower() for scene in scenes for edit in scene.get("edits", ())
+    )
 
 
 def instruction(
