@@ -18,7 +18,7 @@ DECLARED = resources.files("attnwarp_eval.report") / "claims.yaml"
 USED = resources.files("attnwarp_eval.report") / "used_seeds.yaml"
 
 FIRST_SEED = 1001
-"""Least seed of scenes that claims of the third edition on may draw by."""
+"""Least seed of scenes that claims may draw by."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Claim:
     study: str = ""
     scenes: Mapping[str, Any] | None = None
     yaw: tuple[float, float] | None = None
+    edit: str = ""
     equal_within: float | str | None = None
     control: Mapping[str, Any] | None = None
     source: str = ""
     headline: int = 0
     plain: str = ""
-    context: str = ""
 
     @property
     def bound(self) -> float | None:
@@ -84,15 +84,14 @@ def check_seeds(family: Mapping[str, Any]) -> None:
     """Check that no claim is made on scenes that were looked at before it.
 
     Raises:
-        InputError: the family is of the third edition or later, and draws by a seed that is too
-            small, or that something else than the claims' own study has used.
+        InputError: the family draws by a seed that is too small, or that something else than the
+            claims' own studies has used.
     """
-    if family["edition"] < 3:
-        return
     used = read_yaml(USED.read_text())[1]
     for study, scenes in family["scenes"].items():
         seed = scenes["seed"]
-        others = [name for name in used.get(str(seed), []) if name != study]
+        own = [name for name, others in family["scenes"].items() if others["seed"] == seed]
+        others = [name for name in used.get(str(seed), []) if name not in own]
         if seed < FIRST_SEED or others:
             who = ", ".join(others) or "earlier work"
             raise InputError(

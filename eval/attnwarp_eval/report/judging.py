@@ -152,6 +152,8 @@ def measured(results: Results, claims: Iterable[Claim]) -> list[Comparison]:
 def _measured(results: Results, claim: Claim) -> Comparison | None:
     """None if the run lacks a variant of that content."""
     name, layer = claim.probe, str(results.layer)
+    if claim.edit:
+        results = results.by_edit(name).get(claim.edit, replace(results, cells=[]))
     metric = claim.metric.replace("{layer}", layer)
     a, b = (variant_like(results, side, name) for side in (claim.a, claim.b))
     if a is None or b is None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from attnwarp.errors import InputError
@@ -15,7 +14,6 @@ from attnwarp_eval.document.numbers import number as rounded
 from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
 from attnwarp_eval.report.claims import Claim, load_claims
-from attnwarp_eval.report.compared import difference_text, in_words
 from attnwarp_eval.report.judging import (
     COLUMNS,
     Comparison,
@@ -26,12 +24,9 @@ from attnwarp_eval.report.judging import (
     measured,
 )
 from attnwarp_eval.report.raw import PARTS, read_raw, together
-from attnwarp_eval.statistics.contrasts import contrast
-from attnwarp_eval.statistics.intervals import over_scenes, time_ratio
-from attnwarp_eval.study.probe import probe
+from attnwarp_eval.statistics.intervals import time_ratio
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import FIGURE
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 TABLE, LINES = "verdicts", "headlines"
@@ -47,17 +42,12 @@ class Judged:
             side.
         time: ratio of the last side's seconds to the first one's, taken in turn, and the number of
             scenes that were timed; a dash without.
-        by_answers: description of the difference for edits with several right answers and with one,
-            if the study has both.
-        context: the claim's sentence on other variants, filled in.
     """
 
     claim: Claim
     comparison: Comparison | None = None
     time: str = "–"
     report: Path | None = None
-    by_answers: str = ""
-    context: str = ""
 
 
 def verdicts(folder: Path) -> list[Judged]:
@@ -97,46 +87,7 @@ def _judged(
     if one is None:
         return Judged(claim)
     folder, results = studies[claim.study]
-    answers, context = _by_answers(results, one, claim), _context(results, claim)
-    return Judged(claim, one, _time(results, one), folder, answers, context)
-
-
-def _context(results: Results, claim: Claim) -> str:
-    """Fill ``{metric|variant}`` by means over the scenes, in the claim's yaw."""
-
-    def mean(place: re.Match[str]) -> str:
-        table = results.views(claim.probe, place[2], place[1], claim.yaw)
-        return in_words(over_scenes(table).mean, probe(claim.probe).metric(place[1]), place[1])
-
-    return FIGURE.sub(mean, claim.context)
-
-
-def _by_answers(results: Results, one: Comparison, claim: Claim) -> str:
-    if not probe(one.probe).edits:
-        return ""
-    answers = {
-        record.spec["edit"]["name"]: len(record.spec["edit"]["answers"])
-        for _, _, record in results.records(one.probe, one.a)
-        if "edit" in record.spec
-    }
-    if len(set(answers.values())) < 2:
-        return ""
-    texts = []
-    for several, what in ((True, "several right answers"), (False, "one")):
-        a, b = (
-            {
-                scene: {v: x for v, x in views.items() if (answers[v.split("/")[0]] > 1) == several}
-                for scene, views in results.views(one.probe, who, one.metric, claim.yaw).items()
-            }
-            for who in (one.a, one.b)
-        )
-        metric = one.specification
-        apart = replace(contrast(a, b, metric.scale), undefined=0)
-        if apart.by_scene:
-            texts.append(
-                f"{difference_text(apart, metric.unit)} over {apart.scenes} scenes with {what}"
-            )
-    return ", ".join(texts) if len(texts) > 1 else ""
+    return Judged(claim, one, _time(results, one), folder)
 
 
 def _time(results: Results, one: Comparison) -> str:
@@ -160,7 +111,6 @@ def table(claims: list[Judged], beside: Path) -> Table:
             continue
         link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
         claim, verdict, difference, *rest = claim_row(one)
-        difference += f"; {each.by_answers}" * bool(each.by_answers)
         rows.append([claim, verdict, difference, *rest, each.time, f"[{each.claim.study}]({link})"])
     return Table([*COLUMNS, "time", "report"], rows)
 
@@ -176,9 +126,9 @@ def headlines(claims: list[Judged]) -> list[str]:
         assert one is not None
         verdict, reason = claim_verdict(one), f" ({one.reason})" if one.reason else ""
         text = each.claim.plain or each.claim.text
-        difference = each.by_answers or f"{_plainly(one)}, over {one.contrast.scenes} scenes"
-        line = f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{reason}: {difference}."
-        lines.append(f"{line} {each.context}".strip())
+        difference = f"{_plainly(one)}, over {one.contrast.scenes} scenes"
+        told = f"{verdict[0].upper()}{verdict[1:]}{reason}: {difference}."
+        lines.append(f"{number}. **{text}.** {told}")
     return lines
 
 

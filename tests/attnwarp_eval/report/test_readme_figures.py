@@ -174,16 +174,6 @@ def hard_inputs():
     yield f"tried in [{len(ends)} sweeps]"
 
 
-def claims():
-    """Claims, those that were not measured, and those of one edit against itself."""
-    told = page("README.md")
-    rows = told[told.index("<!-- verdicts -->") : told.index("<!-- /verdicts -->")].splitlines()[3:]
-    absent = sum("not measured: " in row for row in rows)
-    same = sum("both sides are equal to the last digit" in row for row in rows)
-    yield f"Of [{len(rows)}](reports/README.md#verdicts) claims {absent} were not measured"
-    yield f"and in {same} both sides are one edit"
-
-
 def start():
     """Seconds of the first edit."""
     row = re.search(r"`attnwarp edit bear .*?` \| (\d+) \|", page("first-hour/report.md"))
@@ -191,7 +181,7 @@ def start():
     yield "in [two minutes](reports/first-hour/report.md) on two cores"
 
 
-TOPICS = (means, drifts, metrics, tracks, light, hard_inputs, claims, start)
+TOPICS = (means, drifts, metrics, tracks, light, hard_inputs, start)
 
 
 @pytest.mark.parametrize("topic", TOPICS)

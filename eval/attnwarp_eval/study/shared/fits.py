@@ -27,6 +27,9 @@ class Fits(Part):
     views: Annotated[int, Field(ge=9, le=10_000)] = 64
     points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
     noise: Annotated[float, Field(ge=0)] = 0.5
+    seed: Annotated[int | None, Field(ge=0)] = Field(
+        None, description="of every fit, so that all seeds of the study share one fit of a scene"
+    )
     settings: dict[str, Any] = Field(
         default_factory=dict, description="fields of attnwarp.fit.FitSettings"
     )
@@ -59,7 +62,8 @@ def settings_of(study: Study, variant: Variant | None, seed: int) -> FitSettings
 def fit_spec(study: Study, variant: Variant | None, seed: int) -> Json:
     """Spec of a fit of one scene."""
     fits = study.part(StudyPart).fit
-    return {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()}
+    settings = settings_of(study, variant, seed if fits.seed is None else fits.seed)
+    return {**fits.model_dump(exclude_none=True), "settings": settings.to_dict()}
 
 
 def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fit:
@@ -91,12 +95,12 @@ def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fi
             spp=spec["spp"],
             points=data["points"],
             noise=data["noise"],
-            seed=spec["seed"],
+            seed=data.get("seed", spec["seed"]),
             geometry=world.geometry,
         )
 
 
 def folder_of(root: Path, spec: Mapping[str, Any]) -> Path:
     """Folder, below a run's folder, of the fit under ``fit`` in a cell's spec."""
-    keys = ("scene", "size", "spp", "seed")
-    return root / "fits" / digest({**spec["fit"], **{key: spec[key] for key in keys}})[:16]
+    keys = ("seed", "scene", "size", "spp")
+    return root / "fits" / digest({key: spec[key] for key in keys} | spec["fit"])[:16]

@@ -9,12 +9,11 @@ from ball_scene import SCENE
 from attnwarp.io import read_ply
 from attnwarp.render import render
 from attnwarp_eval.inspect import subject
-from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, cells_of, load_study, parse_study
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.run import execute, plan
-from attnwarp_eval.study.study import parse_variant
+from attnwarp_eval.study.shared.fits import folder_of
 from attnwarp_eval.world import world
 
 FIT = {"views": 9, "points": 60, "settings": {"iterations": 4, "evaluate_every": 4}}
@@ -96,13 +95,14 @@ def test_claims_tell_fitted_splats_from_sampled_and_2d_from_3d(name):
     assert alike == np.eye(3, dtype=bool).tolist()
 
 
-def test_the_claims_about_fitted_warps_are_about_fitted_splats():
-    study = parse_study({**STUDY, "scenes": ["spheres"], "probes": {"depth": ["sampled"]}})
-    claims = {claim.id: claim for claim in load_claims()}
-    two, three = (
-        parse_variant(side)
-        for side in (claims["fitted-2dgs-labels"].b, claims["fitted-2dgs-labels"].a)
-    )
-    meaning = probe("labels").meaning
-    assert meaning(study, two) == meaning(study, study.variants["2D"])
-    assert meaning(study, three) == meaning(study, study.variants["3D"])
+def test_all_seeds_of_a_study_share_a_fit_whose_seed_it_gives(folder):
+    fits, noise = {}, set()
+    for own in ({}, {"seed": 0}):
+        content = {**STUDY, "fit": {**FIT, **own}, "seeds": [0, 1], "probes": {"warp": ["2D"]}}
+        study = parse_study(content)
+        cells = cells_of(study, {name: load_scene(name) for name in study.scenes})
+        specs = [cell.spec for cell in cells if cell.probe == "warp"]
+        fits[bool(own)] = [str(folder_of(folder, spec)) for spec in specs]
+        noise |= {spec["seed"] for spec in specs}
+    assert len(set(fits[False])) == 2 and noise == {0, 1}
+    assert fits[True] == fits[False][:1] * 2
