@@ -43,14 +43,14 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     from transformers import AutoTokenizer, CLIPTextModel
 
     from attnwarp.editing.latents import HaarLatents
-    from attnwarp.editing.small_unet import EditUNet
+    from attnwarp.editing.small_unet import EditUNet, PartsUNet
 
     def model(name: str, *kinds: Any) -> Any:
         place = folder / name
         return load_network(class_of(place, *kinds), place, device, dtype)
 
     parts = {
-        "unet": model("unet", UNet2DConditionModel, EditUNet),
+        "unet": model("unet", UNet2DConditionModel, EditUNet, PartsUNet),
         "vae": model("vae", AutoencoderKL, AutoencoderTiny, HaarLatents),
         "text_encoder": model("text_encoder", CLIPTextModel),
     }

@@ -72,10 +72,8 @@ class InstructPix2Pix(Latent):
         text_guidance: float = 7.5,
         image_guidance: float = 1.5,
     ) -> None:
-        from attnwarp.editing.small_unet import EditUNet
-
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
-        self.draws = isinstance(unet, EditUNet)
+        self.draws = getattr(unet, "draw", None) is not None
         check_pix2pix(unet.config, text_encoder.config.to_dict(), vae.config)
         most = MOST_GUIDANCE
         self.text_guidance = check.number(text_guidance, -most, most, "text_guidance")

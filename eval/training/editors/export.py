@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 from tokenizers import Tokenizer
 
@@ -15,26 +14,18 @@ from training.editors.net import TOKENS, EditorNet, scheduler
 from training.editors.recipe import STAGES, tokenizer_of, weights_of
 
 
-def _averaged(net: Any, stage: str, out: Path) -> Any:
-    """``net`` with the averaged weights of a stage."""
-    net.load_state_dict(weights_of(out, stage))
-    return net.eval()
-
-
 def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
     tokenizer, plan = tokenizer_of(out), STAGES[stage]
     net = EditorNet(tokenizer.get_vocab_size(), plan.size, draws=plan.draws)
-    parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
-    pipeline = "StableDiffusionInstructPix2PixPipeline"
-    return _write(folder, _averaged(net, stage, out), tokenizer, pipeline, parts, plan.shift)
+    net.load_state_dict(weights_of(out, stage))
+    return write_editor(folder, net, tokenizer, "EditUNet", plan.shift)
 
 
-def _write(
-    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]],
-    shift: float,
-) -> Path:  # fmt: skip
-    """Write an editor's folder with the list of its parts and their checksums."""
+def write_editor(
+    folder: Path, net: EditorNet, tokenizer: Tokenizer, unet: str, shift: float
+) -> Path:
+    """Write an editor's folder with the list of its parts and their checksums; ``unet`` is its class."""
     from transformers import PreTrainedTokenizerFast
 
     net.half()
@@ -47,7 +38,8 @@ def _write(
     )
     words.save_pretrained(folder / "tokenizer")
     index = {
-        "_class_name": pipeline, "requires_safety_checker": False, **parts,
+        "_class_name": "StableDiffusionInstructPix2PixPipeline", "requires_safety_checker": False,
+        "unet": ["attnwarp.editing.small_unet", unet],
         "vae": ["attnwarp.editing.latents", "HaarLatents"],
         "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "PreTrainedTokenizerFast"],
         "scheduler": ["diffusers", "DDIMScheduler"], "safety_checker": [None, None], "feature_extractor": [None, None],

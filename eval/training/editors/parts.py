@@ -25,16 +25,16 @@ from transformers import PreTrainedTokenizerFast
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
 from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, WEIGHTS
-from attnwarp.editing.small_unet import ANSWERS, OPEN, SETTLED, EditUNet
+from attnwarp.editing.small_unet import SETTLED, PartsUNet
 from attnwarp.io.file import write_atomically
 from attnwarp_eval.drawn.worlds import COLORS, HSV, shade
 from attnwarp_eval.scene.base import linear_rgb
 from training.common import descend
 from training.editors.answers import codes
 from training.editors.draws import ALIGNED, DRAW_GAIN
+from training.editors.export import write_editor
 from training.editors.net import (
     SHIFT,
-    TEXT_WIDTH,
     EditorNet,
     draw_steps,
     loss_of,
@@ -60,11 +60,8 @@ PALETTE = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "white"
 RANDOM_COLORS, SHADES = 5, 64
 """Colours before an edit: the named ones and this many others, in that many shades each."""
 
-NEAR, FORBIDDEN = 0.6, 4.0
-"""An answer's score falls by up to FORBIDDEN where the picture before has its colour, within NEAR in the latents' means."""
-
-KIN = 32
-"""Channels that tell which cells belong together."""
+FORBIDDEN = 4.0
+"""An answer's score falls by up to so much where the picture before has its colour."""
 
 TEACH_STEPS, TEACH_BATCH = 1_500, 16
 
@@ -73,7 +70,7 @@ TEACH_STEPS, TEACH_BATCH = 1_500, 16
 class Plan:
     """The training."""
 
-    steps: int = 9_000
+    steps: int = 6_000
     peak: float = 6e-4
     warm: int = 50
     seed: int = 21
@@ -104,97 +101,14 @@ def directions() -> Tensor:
     return codes()[[COLORS.index(c) for c in PALETTE]]
 
 
-class PartsUNet(EditUNet):
-    """Editing UNet whose noise selects an answer at each place.
-
-    The noise is averaged over the cells that look as if they belonged to the same part. What it selects is added to the
-    text at that place alone. Adding a vector to all text tokens adds its projection to the output of a cross-attention, so
-    that is where a place's own vector is added.
-    """
-
-    drawn: Tensor | None = None
-
-    # diffusers reads the configuration's names from this untyped signature.
-    @functools.wraps(EditUNet.__init__)  # type: ignore[misc]
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, **settings)
-        self.draw = None
-        self.kin = torch.nn.Sequential(
-            torch.nn.Conv2d(CHANNELS + 2, 64, 3, padding=1), torch.nn.SiLU(), torch.nn.Conv2d(64, 64, 3, padding=1),
-            torch.nn.SiLU(), torch.nn.Conv2d(64, KIN, 1),
-        )  # fmt: skip
-        first = torch.nn.Linear(CHANNELS + len(PALETTE) + TEXT_WIDTH, ANSWERS)
-        self.pick = torch.nn.Sequential(
-            first, torch.nn.Softmax(dim=-1), torch.nn.Linear(ANSWERS, TEXT_WIDTH)
-        )
-        flat = (
-            HaarLatents()
-            .encode(2 * srgb(palette())[:, :, None, None].expand(-1, -1, BLOCK, BLOCK) - 1)
-            .latents
-        )
-        self.register_buffer("hues", flat[:, :3, 0, 0], persistent=False)
-        for name, module in self.named_modules():
-            if name.endswith("attn2"):
-                module.register_forward_hook(self._add)
-
-    def alike(self, before: Tensor) -> Tensor:
-        """(B, N, N) logarithms of the weights by which cells are averaged."""
-        h, w = before.shape[2:]
-        y, x = (
-            torch.arange(n, device=before.device, dtype=before.dtype) * (BLOCK / 64) - 0.5
-            for n in (h, w)
-        )
-        place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None].expand(
-            len(before), -1, -1, -1
-        )
-        features = self.kin(torch.cat([before, place], dim=1)).flatten(2)
-        # Softmax of minus the squared distance; what depends on the first cell alone drops out.
-        products = features.transpose(1, 2) @ features
-        return torch.log_softmax(2 * products - features.square().sum(dim=1)[:, None], dim=2)
-
-    def evidence(self, noise: Tensor, before: Tensor) -> Tensor:
-        """(B, N, 56) noise averaged over each cell's part, at unit variance, and how near the part is to each answer."""
-        weights = self.alike(before).exp()
-        mean = (
-            weights
-            @ noise.flatten(2).transpose(1, 2)
-            / weights.square().sum(dim=2, keepdim=True).sqrt()
-        )
-        hue = weights @ before[:, :3].flatten(2).transpose(1, 2)
-        near = (-(hue[:, :, None] - self.hues).square().sum(dim=3) / (2 * NEAR**2)).exp()
-        return torch.cat([mean, near], dim=2)
-
-    def forward(
-        self, sample: Tensor, timestep: Any, encoder_hidden_states: Tensor, *args: Any, **more: Any
-    ) -> Any:
-        """Run the base class with what the noise selects."""
-        noisy, before = sample.split(self.config.out_channels, dim=1)
-        time = torch.as_tensor(timestep, dtype=sample.dtype, device=sample.device)
-        share = ((time - SETTLED) / (OPEN - SETTLED)).clamp(0, 1).reshape(-1, 1, 1)
-        if share.any():
-            evidence = self.evidence(noisy, before)
-            text = encoder_hidden_states[:, -1:].expand(-1, evidence.shape[1], -1)
-            drawn = share * self.pick(torch.cat([evidence, text], dim=2))
-            self.drawn = drawn.transpose(1, 2).unflatten(2, noisy.shape[2:])
-        try:
-            return super().forward(sample, timestep, encoder_hidden_states, *args, **more)
-        finally:
-            self.drawn = None
-
-    def _add(self, attention: Any, _: Any, output: Tensor) -> Tensor | None:
-        if self.drawn is None:
-            return None
-        stride = round((self.drawn.shape[2] * self.drawn.shape[3] / output.shape[1]) ** 0.5)
-        drawn = functional.avg_pool2d(self.drawn, stride, ceil_mode=True).flatten(2).transpose(1, 2)
-        return output + functional.linear(attention.to_v(drawn), attention.to_out[0].weight)
-
-
 class PartsNet(EditorNet):
     """Network and text encoder, with the weights of ``small-plain``."""
 
     def __init__(self, vocabulary: int, size: int = 64) -> None:
         super().__init__(vocabulary, size, draws=False)
         self.unet = PartsUNet.from_config(self.unet.config)
+        flat = srgb(palette())[:, :, None, None].expand(-1, -1, BLOCK, BLOCK)
+        self.unet.hues = HaarLatents().encode(2 * flat - 1, return_dict=False)[0][:, :3, 0, 0]
         for module, folder, name in (
             (self.unet, "unet", "diffusion_pytorch_model"), (self.text, "text_encoder", "model")
         ):  # fmt: skip
@@ -398,9 +312,7 @@ def recipe_of(plan: Plan) -> dict[str, Any]:
         "PALETTE",
         "RANDOM_COLORS",
         "SHADES",
-        "NEAR",
         "FORBIDDEN",
-        "KIN",
         "TEACH_STEPS",
         "TEACH_BATCH",
     )
@@ -462,6 +374,13 @@ def load_parts(out: Path, *, averaged: bool = True) -> PartsNet:
         weights = torch.load(out / "parts.pt", weights_only=True)["net"]
     net.load_state_dict(weights)
     return net.eval()
+
+
+@app.command()
+def export(out: Path, folder: Path = WEIGHTS / "small-parts") -> None:
+    """Write the editor with its averaged weights, into the package if no other folder is named."""
+    tokenizer = Tokenizer.from_file(str(START / "tokenizer" / "tokenizer.json"))
+    typer.echo(write_editor(folder, load_parts(out), tokenizer, "PartsUNet", SHIFT))
 
 
 @app.command()
