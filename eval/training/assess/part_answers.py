@@ -42,10 +42,11 @@ DIFFER = 10.0
 
 KINDS: tuple[Kind, ...] = ("self", "cross")
 
-LATE, BY_KIND = (
-    AttentionWarpingSettings(a0=1.0, decay="late"), AttentionWarpingSettings(a0=1.0, decay="by_kind")
+LINEAR, LATE, BY_KIND = (
+    AttentionWarpingSettings(), AttentionWarpingSettings(a0=1.0, decay="late"),
+    AttentionWarpingSettings(a0=1.0, decay="by_kind"),
 )  # fmt: skip
-"""Weights of both kinds alike, and of an edit's default."""
+"""Weights as published, of both kinds alike, and of an edit's default."""
 
 EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
@@ -78,10 +79,8 @@ class Figure:
 def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike) -> Figure:
     """A figure from one answer a question, grouped by world."""
     values, groups = np.asarray(right, dtype=np.float64), np.asarray(worlds)
-    sums = [(values[groups == g].sum(), (groups == g).sum()) for g in np.unique(groups)]
-    table = np.array(sums)
-    rng = np.random.default_rng(0)
-    drawn = table[rng.integers(len(table), size=(2000, len(table)))].sum(axis=1)
+    table = np.array([(values[groups == g].sum(), (groups == g).sum()) for g in np.unique(groups)])
+    drawn = table[redrawn(len(table))].sum(axis=1)
     low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
     tail = 0.025 ** (1 / len(table))
     if (values == 0).all():
@@ -89,6 +88,25 @@ def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike) -> Figure:
     elif (values == 1).all():
         low = tail
     return Figure(what, float(values.mean()), float(low), float(high), len(values))
+
+
+def redrawn(count: int) -> npt.NDArray[np.int64]:
+    """(2000, count) worlds of each bootstrap sample."""
+    return np.random.default_rng(0).integers(count, size=(2000, count))
+
+
+def share_of_gain(marks: Marks, control: str, arm: str, alone: str) -> Figure:
+    """What a control gains over views alone, as a share of what an arm gains over them on the same parts."""
+    worlds = np.array([w for _, w in marks[alone]])
+    sums = np.array([[v for v, _ in marks[key]] for key in (control, arm, alone)])
+    table = np.array([sums[:, worlds == w].sum(axis=1) for w in np.unique(worlds)])
+    drawn = table[redrawn(len(table))].sum(axis=1)
+    shares = (drawn[:, 0] - drawn[:, 2]) / (drawn[:, 1] - drawn[:, 2])
+    low, high = np.quantile(shares, [0.025, 0.975])
+    whole = table.sum(axis=0)
+    value = (whole[0] - whole[2]) / (whole[1] - whole[2])
+    what = "share of that gain which mirrored features have"
+    return Figure(what, float(value), float(low), float(high), len(worlds))
 
 
 class Kept:
@@ -270,7 +288,8 @@ def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = 
         warps = [cases.warp(c) for c in targets]
         mirrored = [Mirrored(w) for w in warps]
         for key, used, settings in (
-            ("both late", warps, LATE), ("by kind", warps, BY_KIND), ("mirrored", mirrored, BY_KIND)
+            ("both linear", warps, LINEAR), ("both late", warps, LATE), ("by kind", warps, BY_KIND),
+            ("mirrored", mirrored, BY_KIND),
         ):  # fmt: skip
             with ExitStack() as stack:
                 for kind in KINDS:
@@ -341,6 +360,12 @@ def part_figures(
             compute() if kept is None else kept.get(f"parts {batch} {first}", compute)
         ).items():
             marks.setdefault(key, []).extend(tuple(v) for v in values)
-    return [
+    found = [
         figure(key, [bool(v) for v, _ in rows], [w for _, w in rows]) for key, rows in marks.items()
     ]
+    if carried:
+        keys = (
+            f"other view, {arm}: the source's answer" for arm in ("mirrored", "by kind", "alone")
+        )
+        found.append(share_of_gain(marks, *keys))
+    return found

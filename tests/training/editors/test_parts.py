@@ -12,7 +12,7 @@ from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES
 from attnwarp_eval.scene.base import linear_rgb
 from training import steps
-from training.assess.part_answers import Cases
+from training.assess.part_answers import Cases, share_of_gain
 from training.editors import parts
 from training.editors.parts import PALETTE, START, PartsNet, PartsPool, Plan
 from training.worlds import recolors, render
@@ -97,6 +97,17 @@ def test_the_judge_names_the_answers_that_are_painted_and_the_picture_before(tok
         image = cases.picture(pool.colored(cases.cuts[:1], colors, 64)[0])
         assert [cases.answer(image, 0, part) for part in (1, 2)] == painted
     assert [cases.answer(cases.before[0], 0, part) for part in (1, 2)] == [len(PALETTE)] * 2
+
+
+def test_a_control_that_turns_one_of_two_parts_of_every_world_has_half_of_the_gain():
+    worlds = [w for w in range(5) for _ in range(2)]
+    marks = {
+        "alone": [(0.0, w) for w in worlds],
+        "carried": [(1.0, w) for w in worlds],
+        "control": [(float(k % 2), w) for k, w in enumerate(worlds)],
+    }
+    share = share_of_gain(marks, "control", "carried", "alone")
+    assert (share.value, share.low, share.high, share.count) == (0.5, 0.5, 0.5, 10)
 
 
 @pytest.mark.slow
