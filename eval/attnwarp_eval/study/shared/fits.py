@@ -27,9 +27,10 @@ class Fits(Part):
     views: Annotated[int, Field(ge=9, le=10_000)] = 64
     points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
     noise: Annotated[float, Field(ge=0)] = 0.5
-    seed: Annotated[int | None, Field(ge=0)] = Field(
-        None, description="of every fit, so that all seeds of the study share one fit of a scene"
-    )
+    seed: Annotated[
+        int | None,
+        Field(ge=0, description="of every fit, so that all seeds of the study share a scene's"),
+    ] = None
     settings: dict[str, Any] = Field(
         default_factory=dict, description="fields of attnwarp.fit.FitSettings"
     )
