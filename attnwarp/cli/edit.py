@@ -38,12 +38,16 @@ from attnwarp.cli.options import (
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads, warned
+from attnwarp.editing.small import bundled as bundled_editors
 from attnwarp.editing.small import check_words, guide_of, own_steps_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
 DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_size")
 """Fields of `Editing` that decide the result of an edit."""
+
+FEWER_STEPS = 10
+"""Steps of `extended` by a bundled editor: as near to the wanted edit as its own 20."""
 
 
 @options_of(Editing, Reading)
@@ -110,12 +114,17 @@ def edit(
     ] = None,
     steps: Annotated[
         int | None,
-        of_method("Denoise in so many steps (default: the editor's own number).", "N", min=1),
+        of_method(
+            "Denoise in so many steps (default: the editor's own number; with extended a bundled"
+            " editor takes 10).",
+            "N",
+            min=1,
+        ),
     ] = None,
     iterations: Annotated[
         int | None,
         of_method(
-            "Tune the splats for so many iterations in each stage (default of extended: 300).",
+            "Tune the splats for so many iterations in each stage (default of extended: 150).",
             "N",
             min=0,
         ),
@@ -260,9 +269,10 @@ def edit(
         if used and method != "attention_warping":
             name = used[0].replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
-        changes.setdefault("steps", own_steps_of(editor))
         if method == "attention_warping" and preset is None:
             preset = "extended"  # carries most; the library's default is the method as corrected
+        fewer = preset == "extended" and editor in bundled_editors()
+        changes.setdefault("steps", FEWER_STEPS if fewer else own_steps_of(editor))
         settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)
         use_threads(editing.threads)

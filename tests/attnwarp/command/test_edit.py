@@ -772,6 +772,28 @@ def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
     assert not (tmp_path / "edited.ply").exists()
 
 
+@pytest.mark.parametrize(
+    ("editor", "more", "steps"),
+    [
+        ("small-plain", (), 10),
+        ("small-plain", ("--preset", "corrected"), 20),
+        ("small-plain", ("--method", "by_view"), 20),
+        ("small-plain", ("--steps", "7"), 7),
+        (None, (), 20),  # Stable Diffusion's published number
+    ],
+)
+def test_extended_takes_half_of_a_bundled_editors_steps_and_all_else_its_own_number(
+    place, tmp_path, monkeypatch, editor, more, steps
+):
+    def chosen(method, preset, **changes):
+        raise ValueError(f"steps: {changes['steps']}")
+
+    monkeypatch.setattr("attnwarp.methods.preset", chosen)
+    given = (place / "data", "--instruction", "make it red", "--editor", editor or place / "editor")
+    result = runner.invoke(app, ["edit", *map(str, given), "--out", str(tmp_path), *more])
+    assert f"steps: {steps}\n" in result.output
+
+
 def test_the_commands_help_names_every_preset():
     text = runner.invoke(app, ["edit", "--help"], env={"COLUMNS": "300"}).output
     joined = re.sub(r"[│\s]", "", text)
