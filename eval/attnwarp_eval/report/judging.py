@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.claims import Claim
 from attnwarp_eval.report.compared import between, difference_text, in_words, no_verdict
@@ -88,6 +88,18 @@ class Comparison:
             return f"equal within {self.claim.bound_in_words}"
         more = "more" if self.contrast.flips.mean > 0 else "less"
         return f"{more}, by less than {self.claim.bound_in_words}"
+
+    @property
+    def hangs_on(self) -> int:
+        """Number of scenes without any one of which the word would be another."""
+        assert self.direction is not None
+        others = 0
+        for scene in self.contrast.by_scene:
+            left = self.contrast.without(scene)
+            p = min(1.0, left.flips.p * self.p / self.contrast.flips.p)
+            test = left.verdict(self.direction, adjusted_p=p, bound=self.bound)
+            others += word_of(test, self.control) != self.word
+        return others
 
     @property
     def reason(self) -> str:
@@ -203,7 +215,10 @@ OUTCOMES = {
 }
 """Outcome of a claim -> its wording, in the order in which claims are shown."""
 
-COLUMNS = ("claim", "verdict", "difference", "measured", "scenes", "control")
+COLUMNS = (
+    "claim", "verdict", "difference", "measured", "spread over scenes, seeds", "scenes × seeds",
+    "hangs on", "control",
+)  # fmt: skip
 """Columns of :func:`claim_row`."""
 
 
@@ -223,15 +238,24 @@ def means_in_words(one: Comparison) -> str:
     return f"{second} against {first}"
 
 
-def claim_row(one: Comparison) -> list[str]:
-    """Cells of a table of claims; the control comes with its share of a gain."""
+def claim_row(one: Comparison, seeds: int = 1) -> list[str]:
+    """Cells of a table of claims; the control comes with its share of a gain.
+
+    Args:
+        seeds: number of seeds of the run.
+    """
     assert one.claim is not None
     control, share = str(one.control.seen), one.control.share
     if one.word in ("better", "worse", "blind") and share is not None and math.isfinite(share[0]):
         control += f": {share_text(share)}"
     verdict = ": ".join(filter(None, (claim_verdict(one), one.reason)))
-    scenes = str(one.contrast.scenes)
-    return [one.claim.text, verdict, one.difference, means_in_words(one), scenes, control]
+    spread = f"{number(one.contrast.deviation, 2)}, {number(one.contrast.over_seeds, 2)}"
+    scenes, told = f"{one.contrast.scenes} × {seeds}", one.word != "not finished"
+    hangs = f"{one.hangs_on} of {one.contrast.scenes}" if told else "–"
+    return [
+        one.claim.text, verdict, one.difference, means_in_words(one), spread, scenes, hangs,
+        control,
+    ]  # fmt: skip
 
 
 def claims_section(results: Results, claims: Sequence[Comparison]) -> Section | None:
@@ -253,7 +277,11 @@ def claims_section(results: Results, claims: Sequence[Comparison]) -> Section | 
         * several
         + ", and the interval is that of the test. **Control**: what has to do worse, such as"
         " features from a wrong place; in percent the share of the gain that it reaches too, from"
-        ' a half on of which the claim is blind. "Can\'t tell" does not mean equal.',
+        ' a half on of which the claim is blind. "Can\'t tell" does not mean equal. **Spread**:'
+        " standard deviation of the difference over scenes, and over the seeds of a scene, on the"
+        " scale of the test. **Hangs on**: scenes without any one of which the verdict would be"
+        " another.",
     ]
-    rows = [claim_row(one) for one in sorted(claims, key=order)]
+    seeds = len(results.study.seeds)
+    rows = [claim_row(one, seeds) for one in sorted(claims, key=order)]
     return Section("Claims", text, [Table(list(COLUMNS), rows)])

@@ -48,6 +48,7 @@ class Judged:
     comparison: Comparison | None = None
     time: str = "–"
     report: Path | None = None
+    seeds: int = 1
 
 
 def verdicts(folder: Path) -> list[Judged]:
@@ -87,7 +88,7 @@ def _judged(
     if one is None:
         return Judged(claim)
     folder, results = studies[claim.study]
-    return Judged(claim, one, _time(results, one), folder)
+    return Judged(claim, one, _time(results, one), folder, len(results.study.seeds))
 
 
 def _time(results: Results, one: Comparison) -> str:
@@ -110,8 +111,8 @@ def table(claims: list[Judged], beside: Path) -> Table:
             rows.append([each.claim.text, absent, *["–"] * len(COLUMNS)])
             continue
         link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
-        claim, verdict, difference, *rest = claim_row(one)
-        rows.append([claim, verdict, difference, *rest, each.time, f"[{each.claim.study}]({link})"])
+        row = claim_row(one, each.seeds)
+        rows.append([*row, each.time, f"[{each.claim.study}]({link})"])
     return Table([*COLUMNS, "time", "report"], rows)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -32,6 +33,8 @@ class Contrast:
         flips: the sign-flip test of ``by_scene``.
         student: Student's t on the same scale.
         plain: the sign-flip test of plain differences, the scale of bounds of shares.
+        over_seeds: standard deviation of a scene's difference over its seeds, on the scale; NaN
+            with one seed.
     """
 
     scale: Scale
@@ -41,6 +44,7 @@ class Contrast:
     flips: SignFlips
     student: Interval
     plain: SignFlips
+    over_seeds: float = math.nan
 
     @property
     def scenes(self) -> int:
@@ -52,6 +56,16 @@ class Contrast:
         """Standard deviation of the scenes' differences, on the scale; NaN below two scenes."""
         values = list(self.by_scene.values())
         return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+
+    def without(self, scene: str) -> Contrast:
+        """The contrast of the other scenes; its ``student`` stays that of all."""
+        kept = np.array([name != scene for name in self.by_scene])
+        return replace(
+            self,
+            by_scene={name: value for name, value in self.by_scene.items() if name != scene},
+            flips=replace(self.flips, differences=self.flips.differences[kept]),
+            plain=replace(self.plain, differences=self.plain.differences[kept]),
+        )
 
     def shown(self, level: float = 0.95) -> tuple[float, float, float]:
         """Mean and bounds for display: b / a for ``ratio`` and ``odds``, else b - a.
@@ -136,7 +150,7 @@ def contrast(
     """Compare b with a, paired on scene and view.
 
     Args:
-        a, b: scene -> view (and seed) -> value, NaN where undefined.
+        a, b: scene -> view, or view/seed -> value, NaN where undefined.
         scale, floor: as for :func:`~attnwarp_eval.statistics.scales.compared`.
         counts: denominators of the shares of a and of b; shares are then compared by their odds.
     """
@@ -144,13 +158,16 @@ def contrast(
         scale = "odds"
     by_scene: dict[str, float] = {}
     plain: list[float] = []
+    variances: list[float] = []
     undefined, largest, each = 0, 0.0, {}
     for scene in sorted(set(a) | set(b)):
         found, differences = [], []
-        for pair, number in _pairs(scene, a, b, counts):
+        seeds = defaultdict(list)
+        for view, pair, number in _pairs(scene, a, b, counts):
             value = compared(*pair, scale, floor=floor, counts=number)
             if math.isfinite(value):
                 found.append(value)
+                seeds[view.partition("/")[1] and view.rpartition("/")[2]].append(value)
                 differences.append(pair[1] - pair[0])
                 largest = max(largest, *map(abs, pair))
             else:
@@ -158,6 +175,8 @@ def contrast(
         if found:
             by_scene[scene], each[scene] = float(np.mean(found)), found
             plain.append(float(np.mean(differences)))
+            if len(seeds) > 1:
+                variances.append(float(np.var([np.mean(own) for own in seeds.values()], ddof=1)))
     rounding = ROUNDING * (1.0 if scale in FACTORS else largest)
     return Contrast(
         scale,
@@ -167,6 +186,7 @@ def contrast(
         SignFlips(np.array(list(by_scene.values())), rounding),
         interval(each),
         SignFlips(np.array(plain), ROUNDING * largest),
+        float(np.sqrt(np.mean(variances))) if variances else math.nan,
     )
 
 
@@ -204,10 +224,10 @@ def paired(a: ByView, b: ByView) -> Interval:
 
 def _pairs(
     scene: str, a: ByView, b: ByView, counts: tuple[ByView, ByView] | None
-) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Figures of each view of a scene, and their denominators."""
+) -> Iterator[tuple[str, tuple[float, float], tuple[float, float]]]:
+    """Key of each view of a scene, its figures, and their denominators."""
     sides = (a, b, *(counts or ({}, {})))
     left, right, *of = (side.get(scene, {}) for side in sides)
     for view in sorted({*left, *right}):
         first, second, *number = (side.get(view, math.nan) for side in (left, right, *of))
-        yield (first, second), (number[0], number[1])
+        yield view, (first, second), (number[0], number[1])

@@ -10,8 +10,9 @@ not hide that all scenes agree.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -119,16 +120,32 @@ def _means_of_parts(values: Array) -> tuple[Array, Array]:
             sizes = np.concatenate([sizes, sizes + 1])
         sums, sizes = sums[1:], sizes[1:]  # without the split that flips no sign
     else:
-        rng = np.random.default_rng(SEED)
         sums, sizes = np.empty(DRAWS), np.empty(DRAWS)
-        step = max(1, 10_000_000 // count)
-        for start in range(0, DRAWS, step):
-            turned = rng.random((min(step, DRAWS - start), count)) < 0.5
-            sums[start : start + len(turned)] = turned @ values
-            sizes[start : start + len(turned)] = turned.sum(axis=1)
+        at = 0
+        for turned in _drawn(count):
+            sums[at : at + len(turned)] = turned @ values
+            sizes[at : at + len(turned)] = turned.sum(axis=1)
+            at += len(turned)
         whole = (sizes == 0) | (sizes == count)
         # Such a pattern equals the observed one for any true mean.
         sums, sizes = np.where(whole, np.nan, sums), np.where(whole, 1, sizes)
     first, second = sums / sizes, (total - sums) / (count - sizes)
     low, high = np.minimum(first, second), np.maximum(first, second)
     return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+
+
+def _drawn(count: int) -> Iterable[npt.NDArray[np.bool_]]:
+    """(B, count) patterns of turned signs, in parts; those of few values are kept."""
+    return _kept(count) if count < 100 else _patterns(count)
+
+
+@lru_cache(maxsize=4)
+def _kept(count: int) -> list[npt.NDArray[np.bool_]]:
+    return list(_patterns(count))
+
+
+def _patterns(count: int) -> Iterator[npt.NDArray[np.bool_]]:
+    rng = np.random.default_rng(SEED)
+    step = max(1, 10_000_000 // count)
+    for start in range(0, DRAWS, step):
+        yield rng.random((min(step, DRAWS - start), count)) < 0.5

@@ -25,6 +25,7 @@ from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.judging import (
+    Comparison,
     claim_row,
     claims_section,
     judge,
@@ -34,6 +35,7 @@ from attnwarp_eval.report.judging import (
 )
 from attnwarp_eval.report.measured import regime
 from attnwarp_eval.scene.yaml import read_yaml
+from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
@@ -629,6 +631,26 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
     assert "One scene says" not in markdown(build(results(CLEAR), tmp_path))
 
 
+@pytest.mark.parametrize(
+    "differences, hangs",
+    [
+        # Of six equal signs p is 2 / 2**6, of five twice as much.
+        ([0.5] * 6, 6),
+        # A small one of eight against the others: 4 / 2**8; of seven 4 / 2**7, or 2 / 2**7.
+        ([1.0] * 7 + [-0.01], 0),
+        # A large one keeps it from being told: without it all signs are one.
+        ([0.2] * 7 + [-3.0], 1),
+    ],
+)
+def test_a_verdict_hangs_on_the_scenes_without_any_one_of_which_it_is_another(differences, hangs):
+    """Oracle: the binomial distribution of signs."""
+    sides = {f"s{k}": {"v": 5.0 + d} for k, d in enumerate(differences)}
+    value = contrast({scene: {"v": 5.0} for scene in sides}, sides, "plain")
+    claim = dataclasses.replace(SLIP_CLAIM, equal_within=None)
+    (one,) = judged([Comparison("warp", SLIP, "good", "slipped", value, "higher", claim=claim)])
+    assert one.hangs_on == hangs
+
+
 def test_a_study_that_judges_claims_begins_with_their_verdicts():
     claims = [SLIP_CLAIM, dataclasses.replace(SLIP_CLAIM, text="It does not", expect="lower")]
     run = drawn(CLEARLY, title="What slips")
@@ -638,10 +660,10 @@ def test_a_study_that_judges_claims_begins_with_their_verdicts():
     )
     # The mean of the eight is 0.65 px.
     means = "0.65 px of a 64 grid against 0.10 px of a 64 grid"
-    rows = [[row[0], row[1], *row[3:]] for row in section.tables[0].rows]
+    rows = [[*row[:2], row[3], *row[5:]] for row in section.tables[0].rows]
     assert rows == [
-        ["It slips", "holds", means, "8", "none"],
-        ["It does not", "the opposite holds", means, "8", "none"],
+        ["It slips", "holds", means, "8 × 1", "0 of 8", "none"],
+        ["It does not", "the opposite holds", means, "8 × 1", "0 of 8", "none"],
     ]
     assert section.text[1].startswith("Of 8 scenes drawn by generator")
     assert "for all 2 claims" in section.text[1]

@@ -163,7 +163,11 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     whole = table(claims, tmp_path)
     (cells,) = [row for row in whole.rows if row[-1] != "–"]
     row = dict(zip(whole.columns, cells, strict=True))
-    assert row["verdict"] == "holds" and row["scenes"] == "8"
+    assert row["verdict"] == "holds" and row["scenes × seeds"] == "8 × 1"
+    # Without any one of eight scenes the seven others are still all of one sign: p = 2 / 2**7.
+    assert row["hangs on"] == "0 of 8"
+    spread = np.log(factors).std(ddof=1)
+    assert row["spread over scenes, seeds"] == f"{spread:.2g}, –"
     assert row["difference"].startswith(f"× {np.exp(np.log(factors).mean()):.2f} (")
     assert row["time"] == "2.00 [2.00, 2.00], 2 scenes"
     assert row["report"] == "[suite](reports/suite/report.md)"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from attnwarp_eval.statistics.contrasts import paired
+from attnwarp_eval.statistics.contrasts import contrast, paired
 from attnwarp_eval.statistics.intervals import (
     benjamini_hochberg,
     common,
@@ -258,3 +258,27 @@ def test_rounds_that_do_not_belong_together_are_refused():
         time_ratio([[1.0, 2.0]], [[1.0]])
     with pytest.raises(ValueError, match="positive"):
         time_ratio([[1.0, 0.0]], [[1.0, 1.0]])
+
+
+def test_the_spread_over_a_scenes_seeds_is_the_root_of_the_mean_variance_of_their_means():
+    rng = np.random.default_rng(2)
+    values = rng.normal(0, 1, (4, 3, 2))  # scenes, seeds, views
+    tables = [
+        {
+            f"s{i}": {
+                f"{v}/{s}": float(x)
+                for s, row in enumerate(own)
+                for v, x in zip("ab", row, strict=True)
+            }
+            for i, own in enumerate(side)
+        }
+        for side in (np.zeros_like(values), values)
+    ]
+    variance = values.mean(axis=2).var(axis=1, ddof=1).mean()
+    found = contrast(*tables, "plain")
+    assert found.over_seeds == pytest.approx(np.sqrt(variance))
+    assert found.deviation == pytest.approx(values.mean(axis=(1, 2)).std(ddof=1))
+    alone = [
+        {s: {k: x for k, x in t.items() if k.endswith("0")} for s, t in e.items()} for e in tables
+    ]
+    assert np.isnan(contrast(*alone, "plain").over_seeds)
