@@ -153,8 +153,9 @@ def test_a_population_that_cannot_be_is_refused_with_its_line(study_file, scenes
 def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it(tmp_path):
     """The seeds in the cells themselves; those of a scene's methods are equal."""
     (tmp_path / "my.yaml").write_text(
-        "extends: ablation\nname: my\nseeds: [0]\n"
-        "probes: {editing: [default, each view alone]}\nablations: []\nfronts: []\n"
+        "extends: ablation\nname: my\n"
+        "probes: {editing: [corrected, each view alone]}\nablations: []\n"
+        "fronts: []\npictures: null\n"
     )
     study = load_study(str(tmp_path / "my.yaml"), scenes=["drawn-2", "drawn-5"])
     seeds = defaultdict(set)
