@@ -9,9 +9,13 @@ import mpmath
 import numpy as np
 
 from attnwarp.camera import Camera
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Mesh, Rectangle, Sphere
+from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.stability.case import Bound, Way, exact, hard
 from attnwarp_eval.truth import Geometry
+from attnwarp_eval.truth.shapes import NEW, UNCOVERED, UNTOUCHED, ShapeEdit
+from attnwarp_eval.two_view import AMBIGUOUS
 
 DIGITS = 60
 
@@ -104,6 +108,79 @@ def _shared_edge(offset: float, way: Way) -> float:
     return float(np.abs(hits.t - (origins[:, 2] - offset)).max())
 
 
+EYE, FIELD = 4.0, 40.0
+"""Distance of the cameras from the ball's centre, in scene units, and field of view in degrees."""
+
+
+def _ball_scene(radius: float, card: float) -> Scene:
+    """A ball at the origin, seen by the source along x and by a target along y.
+
+    Args:
+        radius: of the ball, 0 for none.
+        card: half the side of a square before the target, half way to the ball; 0 for none.
+    """
+    there = {"wall": True, "card": card > 0, "ball": radius > 0}
+    shapes = {
+        "wall": {"type": "box", "center": [-3, -3, 0], "size": [1, 1, 1]},
+        "card": {"type": "box", "center": [0, 2, 0], "size": [2 * card, 1e-6, 2 * card]},
+        "ball": {"type": "sphere", "center": [0, 0, 0], "radius": radius},
+    }
+    grey = {"type": "plain", "color": "#808080"}
+    views = {"look_at": [0, 0, 0], "radius": EYE, "fov": FIELD, "size": [24, 24]}
+    spec = {
+        "name": "ball",
+        "title": "a ball",
+        "objects": [
+            {"name": name, "shape": shape, "texture": grey}
+            for name, shape in shapes.items()
+            if there[name]
+        ],
+        "lights": [{"type": "sun", "elevation": 60, "azimuth": 0, "irradiance": 1}],
+        "cameras": {
+            **views,
+            "source": {"yaw": 0, "height": 0},
+            "targets": [{"yaw": 90, "height": 0}],
+        },
+    }
+    return Scene(SceneSpec.model_validate(spec))
+
+
+def _wrong_labels(before: Scene, after: Scene, radius: float, card: float, label: int) -> float:
+    """Pixels of both views whose label is not the one that the ball's outline gives."""
+    edit, wrong = ShapeEdit(before, after), 0
+    for camera, hidden in ((before.source, 0.0), (before.targets[0], card)):
+        labels = edit.labels(camera)
+        corners = np.stack(np.meshgrid(*2 * [np.arange(25.0)]), axis=-1)
+        answers = []
+        for xy in (corners, camera.pixel_centers()):
+            ray = camera.directions(xy)
+            x, y = ray[..., 0], ray[..., 1]
+            # The outline of a sphere: an angle from the axis whose sine is radius over distance.
+            ball = np.hypot(x, y) < math.tan(math.asin(radius / EYE))
+            answers.append(ball & ~(np.maximum(abs(x), abs(y)) * EYE / 2 < hidden))
+        corner, center = answers
+        four = [corner[i : i + 24, j : j + 24] for i in (0, 1) for j in (0, 1)]
+        sure = np.all([each == center for each in four], axis=0)
+        wanted = np.where(sure, np.where(center, label, UNTOUCHED), AMBIGUOUS)
+        gone = sure & center if label == UNCOVERED else np.zeros_like(sure)
+        wrong += int((labels.label != wanted).sum() + (labels.gone != gone).sum())
+    return float(wrong)
+
+
+def _removed_unseen(share: float, way: Way) -> float:
+    """Wrong labels of a ball that is removed, which a card hides from the target, up to a share."""
+    radius = 0.7
+    card = share * EYE / 2 * math.tan(math.asin(radius / EYE))
+    return _wrong_labels(_ball_scene(radius, card), _ball_scene(0, card), radius, card, UNCOVERED)
+
+
+def _added_filling(share: float, way: Way) -> float:
+    """Wrong labels of a ball that is added and fills a share of the source's half diagonal."""
+    diagonal = math.atan(math.sqrt(2) * math.tan(math.radians(FIELD / 2)))
+    radius = EYE * math.sin(share * diagonal)
+    return _wrong_labels(_ball_scene(0, 0), _ball_scene(radius, 0), radius, 0, NEW)
+
+
 CASES = [
     hard(
         "grazing_plane",
@@ -138,4 +215,6 @@ CASES = [
         (Way("embree"),),
         bounds=Bound("m", 3e-6, "1e-6 of the distance"),
     ),
+    hard("removed_unseen", _removed_unseen, RAYS, bounds=exact("wrong labels")),
+    hard("added_filling", _added_filling, RAYS, bounds=exact("wrong labels")),
 ]
