@@ -72,8 +72,8 @@ def edge_section(
     layout: Layout,
     probe: str,
     metrics: Mapping[str, Figures],
-    beside: Mapping[str, Sequence[tuple[float, ByView]]],
-    axis: str,
+    beside: Mapping[str, Sequence[tuple[float, ByView]]] | None = None,
+    axis: str = "",
 ) -> Section | None:
     """Section on depth edges: one figure and one table; None if not asked for.
 
@@ -81,7 +81,7 @@ def edge_section(
         results, layout: run and layout of the report.
         probe: name of the probe.
         metrics: figures by row.
-        beside: line -> (x, shares), of the figure's second panel.
+        beside: line -> (x, shares), of the figure's second panel; None for one panel.
         axis: title of that panel's x axis.
     """
     if edges_of(results.study, probe) is None or not results.finished(probe):
@@ -97,7 +97,7 @@ def edge_section(
     ]
     further = [
         charts.Line(name, [x for x, _ in line], [over_scenes(table) for _, table in line])
-        for name, line in beside.items()
+        for name, line in (beside or {}).items()
     ]
     further = [line for line in further if sum(np.isfinite(y.mean) for y in line.y) > 1]
     panels = [(near, "tokens to the nearest depth edge"), *[(further, axis)] * bool(further)]

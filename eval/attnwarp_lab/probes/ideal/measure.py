@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -47,37 +47,48 @@ UNABLE = ("dge", "gaussctrl", "fused")
 
 
 @dataclass(frozen=True)
-class IdealResult:
-    """Entries of a cell's record besides the figures of its views.
+class EditorResult:
+    """Entries of a cell's record on the ideal editor, besides the figures of its views.
 
     Attributes:
         share: share of signal, solved from the editor's ``settled``.
         settled, frequencies, agreement: settled, frequencies and agreement of views edited alone,
             :class:`attnwarp_lab.ideal.share.Alone`.
         fault: reason why the editor is not ideal; None if it is ideal.
-        part_share: mean share of a view's pixels covered by a part, over views that show it.
-        answers: answers of each part in the source's edit, -1 for hidden parts.
-        edited: number of edited views.
+        answers: answers of each part or place in the source's edit, -1 where it shows none.
     """
 
+    entry: ClassVar[str]
     share: float
     settled: float
     frequencies: tuple[float, ...]
     agreement: float
     fault: str | None
-    part_share: float
     answers: tuple[int, ...]
-    edited: int
 
     def to_json(self) -> Json:
-        """The record's entry ``ideal``."""
-        return {"ideal": asdict(self)}
+        """The record's entry."""
+        return {self.entry: asdict(self)}
 
     @classmethod
-    def from_json(cls, data: Json) -> IdealResult:
-        """Rebuild from :meth:`to_json`."""
-        lists = {key: tuple(data[key]) for key in ("frequencies", "answers")}
-        return cls(**{**data, **lists})
+    def from_json(cls, data: Json) -> Self:
+        """Rebuild from the record."""
+        own = data[cls.entry].items()
+        return cls(**{key: tuple(of) if isinstance(of, list) else of for key, of in own})
+
+
+@dataclass(frozen=True)
+class IdealResult(EditorResult):
+    """Those of an edit in parts.
+
+    Attributes:
+        part_share: mean share of a view's pixels covered by a part, over views that show it.
+        edited: number of edited views.
+    """
+
+    entry = "ideal"
+    part_share: float
+    edited: int
 
 
 @register
@@ -180,15 +191,10 @@ class IdealProbe(MethodProbe[IdealResult]):
         inside = [labels[labels >= 0] for labels in thing.labels.values()]
         counts = [np.unique(own, return_counts=True)[1] for own in inside]
         return IdealResult(
-            share,
-            checked.settled,
-            checked.frequencies,
-            checked.agreement,
-            checked.fault(),
-            float(np.concatenate(counts).mean()) / spec["size"] ** 2,
+            share, checked.settled, checked.frequencies, checked.agreement, checked.fault(),
             tuple(int(answer) for answer in answers),
-            len(edited),
-        )
+            float(np.concatenate(counts).mean()) / spec["size"] ** 2, len(edited),
+        )  # fmt: skip
 
     def _donor(self, work: Work, share: float) -> Donor | None:
         """The other scene's source with an editor of its answers; None without one."""
@@ -228,7 +234,7 @@ class IdealProbe(MethodProbe[IdealResult]):
 
     def read_extra(self, data: Json) -> IdealResult:
         """Read from the record's entry ``ideal``."""
-        return IdealResult.from_json(data["ideal"])
+        return IdealResult.from_json(data)
 
 
 def _thing(

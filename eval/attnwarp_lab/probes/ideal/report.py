@@ -29,8 +29,27 @@ DRIFTING = {
 """Probes of methods whose editor drifts: the editor, what is shown, and its metric."""
 
 
+class EditorReport(ProbeReport):
+    """What reports of edits by the ideal editor share: the cost, and editors that are not ideal."""
+
+    cost = "whole"
+    cost_of = "an edit"
+    cost_text = "Seconds are those of one whole edit of a scene by the ideal editor, with tuning."
+
+    def problems(self, results: Results) -> list[str]:
+        """Editors that are not ideal: they have favourite answers, or agree without features."""
+        variants: dict[tuple[str, str], list[str]] = {}
+        for cell, record in results.finished(self.name):
+            if record.extra.fault is not None:
+                variants.setdefault((cell.scene, record.extra.fault), []).extend(cell.variants)
+        return [
+            f"{scene}: not ideal in {', '.join(names)}: {fault}"
+            for (scene, fault), names in sorted(variants.items())
+        ]
+
+
 @register_report
-class IdealReport(ProbeReport):
+class IdealReport(EditorReport):
     """Seen, through, bleed and dE by variant, to be read together."""
 
     name = "ideal"
@@ -54,20 +73,6 @@ class IdealReport(ProbeReport):
         "parts.seen.render",
         "parts.delta_e.render",
     )
-    cost = "whole"
-    cost_of = "an edit"
-    cost_text = "Seconds are those of one whole edit of a scene by the ideal editor, with tuning."
-
-    def problems(self, results: Results) -> list[str]:
-        """Editors that are not ideal: they have favourite answers, or agree without features."""
-        variants: dict[tuple[str, str], list[str]] = {}
-        for cell, record in results.finished(self.name):
-            if record.extra.fault is not None:
-                variants.setdefault((cell.scene, record.extra.fault), []).extend(cell.variants)
-        return [
-            f"{scene}: not ideal in {', '.join(names)}: {fault}"
-            for (scene, fault), names in sorted(variants.items())
-        ]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """The editor by scene: share of signal, settling of answers, statistics alone; figures by

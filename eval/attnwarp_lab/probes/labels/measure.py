@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
 import torch
 from pydantic import Field
 
-from attnwarp.warp import WarpedView, WarpSettings, warp_view
+from attnwarp.warp import WarpedView
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
@@ -19,9 +18,8 @@ from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
 from attnwarp_eval.study.shared.controls import MovedView
 from attnwarp_eval.study.shared.edits import VariantPart
-from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
-from attnwarp_eval.study.shared.warps import WarpProbe, warp_truth, warped_views
+from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 from attnwarp_eval.two_view import TwoView
 from attnwarp_lab.ideal.edges import PLACES, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
@@ -90,7 +88,7 @@ class LabelTransport(WarpProbe):
             yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Depth, rules, grids and parts; an exact mask, a control, and what edges need."""
+        """Depth, rules, grids and parts; an exact mask, a control, and the parts at edges."""
         edges, own = edges_of(study, self.name), variant.part(VariantPart)
         parts, further = study.part(StudyPart).labels.parts, dict[str, Any]()
         if own.mask == "truth":
@@ -98,8 +96,7 @@ class LabelTransport(WarpProbe):
         if own.control is not None:
             further["control"] = own.control
         if edges is not None and any(study.variants[name] == variant for name in edges.named):
-            chained = any(study.variants[name] == variant for name in edges.methods)
-            further["edges"] = {"parts": edges.parts or parts[0], "chained": chained}
+            further["edges"] = {"parts": edges.parts or parts[0]}
         return {
             **super().variant_spec(study, variant, seed),
             "grids": grids_of(study, study.size),
@@ -116,7 +113,7 @@ class LabelTransport(WarpProbe):
         """Warp, carry and count, view by view."""
         spec, world, meter = work.spec, work.world, work.meter
         names = [world.source.name, *spec["views"]]
-        edges = spec.get("edges", {"parts": spec["parts"][0], "chained": False})
+        edges = spec.get("edges", {"parts": spec["parts"][0]})
         with meter.stage("truth"):
             cameras = [world.camera(name) for name in names]
             labels = {
@@ -125,10 +122,9 @@ class LabelTransport(WarpProbe):
             }
         grids: list[int] = spec["grids"]
         near = min(grids, key=lambda grid: abs(grid - spec["size"] / FACTOR))
-        links = _linked(work) if edges["chained"] else {}
         fine = labels[edges["parts"]]
-        source = chained = token_parts(fine[names[0]], (near, near))
-        for link, (name, truth, view) in enumerate(warped_views(work, grids), 1):
+        source = token_parts(fine[names[0]], (near, near))
+        for name, truth, view in warped_views(work, grids):
             if "mask" in spec:
                 view = view.with_mask(torch.from_numpy(np.ascontiguousarray(truth.visible)))
             if "control" in spec:
@@ -145,28 +141,8 @@ class LabelTransport(WarpProbe):
             if "edges" not in spec:
                 places = {place: places[place] for place in PLACES}
             figures |= _by_place(carried_labels(layer, source), truth, fine[name], places)
-            if edges["chained"]:
-                chained = carried_labels(links.get(name, view).at((near, near)), chained)
-                chain = _by_place(chained, truth, fine[name], places)
-                figures |= {f"{key}.chain": value for key, value in chain.items()}
-                for end in ("", ".chain"):
-                    figures[f"labels.right.link{link}{end}"] = figures[f"labels.right.all{end}"]
             work.add(name, figures)
         return NoExtra()
-
-
-def _linked(work: Work) -> dict[str, WarpedView]:
-    """Warps into each target but the first, from the target before it."""
-    spec, world = work.spec, work.world
-    settings = WarpSettings.from_dict(spec["settings"])
-    pairs = {name: world.between(before, name) for before, name in pairwise(spec["views"])}
-    if spec.get("geometry") == "truth":
-        return {name: warp_truth(world, pair, settings) for name, pair in pairs.items()}
-    model = splats_of(work)
-    return {
-        name: warp_view(model, pair.source, pair.target, settings, warn_empty=False)
-        for name, pair in pairs.items()
-    }
 
 
 def _figures(

@@ -43,9 +43,7 @@ class LabelReport(ProbeReport):
     stage = "pair"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """Fate of tokens, by variant; errors at depth edges, from the source and from view
-        to view.
-        """
+        """Fate of tokens, by variant; errors at depth edges."""
         names = dict.fromkeys(v for c, _ in results.finished(self.name) for v in c.variants)
         rows = [
             [n, *mean_values(results, self.name, n, self.columns.values())]
@@ -60,17 +58,7 @@ class LabelReport(ProbeReport):
         if edges is None:
             return
         metrics = {name: (name, RIGHT, HIDDEN) for name in edges.named}
-        most = max((len(r.views) for _, r in results.finished(self.name)), default=0)
-        links, beside = range(1, most + 1), {}
-        for name in edges.methods:
-            chain = f"{name}, from view to view"
-            metrics[chain] = name, f"{RIGHT}.chain", f"{HIDDEN}.chain"
-            for title, metric in ((name, "link{}"), (chain, "link{}.chain")):
-                beside[title] = [
-                    (link, results.views(self.name, name, f"labels.right.{metric.format(link)}"))
-                    for link in links
-                ]
-        section = edge_section(results, layout, self.name, metrics, beside, "links of a chain")
+        section = edge_section(results, layout, self.name, metrics)
         if section is not None:
             yield section
 

@@ -6,7 +6,7 @@ Figures of the edited views, and of the depth of the splats tuned on them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -37,6 +37,7 @@ from attnwarp_lab.ideal.figures import part_answers
 from attnwarp_lab.ideal.places import Places
 from attnwarp_lab.ideal.shape_figures import ShapeTruth, depth_figures, shape_figures
 from attnwarp_lab.ideal.share import alone, solve_share
+from attnwarp_lab.probes.ideal.measure import EditorResult
 
 Image = npt.NDArray[np.float32]
 
@@ -66,29 +67,15 @@ class ShapeVariantPart(Part):
 
 
 @dataclass(frozen=True)
-class ShapeResult:
+class ShapeResult(EditorResult):
     """Entries of a cell's record besides the figures of its views.
 
     Attributes:
-        share: share of signal.
-        settled, frequencies, agreement: those of places edited alone,
-            :class:`attnwarp_lab.ideal.share.Alone`.
-        fault: reason why the editor is not ideal; None if it is ideal.
-        answers: answers of the places in the source's edit, -1 where it tells none.
         splats: numbers of splats before and after.
     """
 
-    share: float
-    settled: float
-    frequencies: tuple[float, ...]
-    agreement: float
-    fault: str | None
-    answers: tuple[int, ...]
+    entry = "shape"
     splats: tuple[int, int]
-
-    def to_json(self) -> Json:
-        """The record's entry ``shape``."""
-        return {"shape": asdict(self)}
 
 
 @register
@@ -193,9 +180,7 @@ class ShapeProbe(MethodProbe[ShapeResult]):
 
     def read_extra(self, data: Json) -> ShapeResult:
         """Read from the record's entry ``shape``."""
-        own = data["shape"]
-        lists = {key: tuple(own[key]) for key in ("frequencies", "answers", "splats")}
-        return ShapeResult(**{**own, **lists})
+        return ShapeResult.from_json(data)
 
 
 def places_of(study: Study, scene: Scene) -> list[str]:
