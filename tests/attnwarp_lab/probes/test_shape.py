@@ -104,5 +104,8 @@ def test_a_stage_of_a_seeded_tuning_begins_with_splats_on_what_is_new():
     floor = from_points(grid, kind="2d", sh_degree=0)
     tuning = SeededTuning(floor, views.cameras, settings, 2, originals=originals)
     tuning.advance(0, 2, Views(views.cameras, list(views.after)), range(4))
-    away = np.linalg.norm(tuning.gaussians().world_means()[len(floor) :], axis=1)
+    after = tuning.gaussians()
+    away = np.linalg.norm(after.world_means()[len(floor) :], axis=1)
     assert len(away) > 100 and np.quantile(away, 0.1) > 0.4 and np.median(away) < 0.6
+    # A pixel 4 away is 0.07 wide; a splat as large as the gap to others would hide the floor.
+    assert after.scales[len(floor) :].max() < 0.1

@@ -120,10 +120,12 @@ class SeededTuning(Tuning):
         places, colors = edited.seeds()
         if len(places) < LEAST_SEEDS:
             return
-        new = Model(
-            from_points(places, colors, kind=self.fit.kind, sh_degree=self.fit.sh_degree),
-            self.fit, model.extent,
-        )  # fmt: skip
+        start = from_points(places, colors, kind=self.fit.kind, sh_degree=self.fit.sh_degree)
+        # A place far from others would get a splat as large as the gap, before much else.
+        pixel = [c.project(start.world_means())[1] / c.K[0, 0] for c in views.cameras]
+        size = torch.from_numpy(np.where(np.array(pixel) > 0, pixel, np.inf).min(axis=0)).float()
+        start = start.unchecked(scales=size[:, None].expand_as(start.scales).contiguous())
+        new = Model(start, self.fit, model.extent)
         added = {name: tensor.detach() for name, tensor in new.tensors.items()}
         added["means"] = added["means"] + torch.from_numpy(new.origin - model.origin).float()
         model.replace(torch.arange(len(model)), added)
