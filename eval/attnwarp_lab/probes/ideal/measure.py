@@ -18,7 +18,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared.drifts import DriftPart
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import Donor
@@ -74,7 +74,8 @@ class EditorResult:
     def from_json(cls, data: Json) -> Self:
         """Rebuild from the record."""
         own = data[cls.entry].items()
-        return cls(**{key: tuple(of) if isinstance(of, list) else of for key, of in own})
+        given: Json = {key: tuple(of) if isinstance(of, list) else of for key, of in own}
+        return cls(**given)
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,20 @@ class IdealResult(EditorResult):
     edited: int
 
 
+def with_ideal_editor(study: Study, probe: str) -> Iterator[tuple[str, Variant]]:
+    """Variants of a probe by name, each of which must have the ideal editor.
+
+    Raises:
+        ValueError: a variant has another editor.
+    """
+    for name in study.probes.get(probe, []):
+        if editor_of(study, study.variants[name]).ideal is None:
+            raise ValueError(
+                f"probes.{probe}: {name!r} has no ideal editor; give it editor: {{ideal: {{}}}}"
+            )
+        yield name, study.variants[name]
+
+
 @register
 class IdealProbe(MethodProbe[IdealResult]):
     """One edit of a thing in parts by one method and the ideal editor."""
@@ -103,14 +118,8 @@ class IdealProbe(MethodProbe[IdealResult]):
     def check(self, study: Study) -> None:
         """Require the ideal editor for every variant, and a method that it supports."""
         edges_of(study, self.name)
-        for name in study.probes.get(self.name, []):
-            variant = study.variants[name]
+        for name, variant in with_ideal_editor(study, self.name):
             own = variant.part(VariantPart)
-            if editor_of(study, variant).ideal is None:
-                raise ValueError(
-                    f"probes.{self.name}: {name!r} has no ideal editor; give it editor:"
-                    " {ideal: {}}"
-                )
             if own.method in UNABLE:
                 raise ValueError(
                     f"probes.{self.name}: method {own.method!r} of {name!r} changes attention"
