@@ -124,7 +124,7 @@ def edit(
     iterations: Annotated[
         int | None,
         of_method(
-            "Tune the splats for so many iterations in each stage (default of extended: 150).",
+            "Tune the splats for so many iterations in each stage (default of extended: 300).",
             "N",
             min=0,
         ),

@@ -267,8 +267,6 @@ PRESETS: dict[str, MethodSettings] = {
         unseen="attend",
         a0=1.0,
         decay="by_kind",
-        iterations=150,  # larger steps make up for fewer iterations
-        color_rate=12.0,
     ),
 }
 """Presets by name, the default first; see :data:`attnwarp.methods.PRESETS`."""

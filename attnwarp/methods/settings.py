@@ -130,8 +130,7 @@ tunes on everything edited so far, with larger steps of the colours.
 
 ``extended``: ``corrected`` with extensions beyond the paper: noise that sticks to the surface, the
 source's features at a weight that depends on the kind of attention, tolerant masks, and attention
-to the source's edit where no warp reaches the marked thing. It tunes for half of the iterations, in
-which colours take three times as large steps.
+to the source's edit where no warp reaches the marked thing.
 
 ``default`` of the other methods: the method with the editor's default guidance and prompts. Their
 other presets use the guidance, prompts and step grid published for Stable Diffusion.
