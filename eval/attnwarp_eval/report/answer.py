@@ -10,6 +10,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.compared import in_words, unit_in_words, without_unit
+from attnwarp_eval.report.controls import control_share, share_text
 from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, side_by_side
@@ -81,6 +82,11 @@ def _filled(results: Results, asked: Answer, sentence: str) -> str:
 
     def figure(match: re.Match[str]) -> str:
         column = columns[match[1]]
+        if column.control:
+            three = (match[2], column.control, column.alone)
+            tables = (results.views(column.probe, n, column.metric, column.yaw) for n in three)
+            sign = -1 if probe(column.probe).metric(column.metric).direction == "lower" else 1
+            return share_text(control_share(*tables, sign=sign))
         value, key = _figure(results, column, match[2])
         return in_words(value.mean, probe(column.probe).metric(key), key)
 

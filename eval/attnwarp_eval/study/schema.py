@@ -131,11 +131,17 @@ FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")
 
 
 class AnswerColumn(Part):
-    """A column of an answer's table: a metric, over targets within a range of yaws, in degrees."""
+    """A column of an answer's table: a metric, over targets within a range of yaws, in degrees.
+
+    With ``control`` and ``alone``, for sentences only: the share of a variant's gain over ``alone``
+    that the control reaches, with its interval.
+    """
 
     metric: str
     probe: str = ""
     yaw: tuple[float, float] | None = None
+    control: str = ""
+    alone: str = ""
 
 
 class AnswerPictures(Part):

@@ -106,6 +106,7 @@ class _Joined(Study):
         for key, columns in (("columns", asked.columns), ("figures", asked.figures)):
             for title, column in columns.items():
                 rows = list(asked.variants) if key == "columns" else []
+                rows += [column.control, column.alone] if column.control else []
                 self._check_table(column.probe, rows, f"answer.{key}.{title}")
                 _known_metric(
                     column.metric, available[column.probe], f"answer.{key}.{title}.metric"

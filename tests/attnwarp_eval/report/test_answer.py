@@ -57,6 +57,18 @@ def run(scenes=SCENES, asked=STUDY["answer"], taken=None):
     return written_runs.results(study, cells)
 
 
+def test_a_sentence_has_the_share_of_a_gain_that_a_control_reaches():
+    column = {"probe": "warp", "metric": HIDDEN, "alone": "open"}
+    figures = {
+        "none": {**column, "control": "open"},  # reaches what is reached without anything
+        "all": {**column, "control": "masked"},
+    }
+    asked = {**STUDY["answer"], "figures": figures}
+    asked["sentences"] = ["The control reaches {none|masked}, or {all|masked}."]
+    text = answer(run(asked=asked)).text
+    assert text[1] == "The control reaches 0 % (0 to 0 %), or 100 % (100 to 100 %)."
+
+
 def test_an_answer_has_the_means_over_scenes_of_views_in_range_as_words():
     section = answer(run(taken=(0.05, 0.05)))
     assert section.text[:2] == [
