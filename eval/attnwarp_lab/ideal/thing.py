@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from cv2 import INTER_NEAREST
@@ -18,7 +17,6 @@ from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.two_view import TwoView
 from attnwarp_lab.ideal.editor import FACTOR, Answers, Cross, IdealEditor
 from attnwarp_lab.ideal.figures import PartTruth
-from attnwarp_lab.ideal.joint import IdealJointEditor
 from attnwarp_lab.ideal.paint import answer_colors, painted
 from attnwarp_lab.ideal.parts import Labels, part_labels, token_parts
 from attnwarp_lab.ideal.share import Grams
@@ -135,10 +133,8 @@ class Thing:
         """Gram matrices of the parts, which decide the share of signal."""
         return Grams.of(self.views)
 
-    def editor(self, share: float, cross: Cross | Literal["joint"] = "paint") -> IdealEditor:
-        """The editor of these views, or its twin with joint attention."""
-        if cross == "joint":
-            return IdealJointEditor(self.views, share)
+    def editor(self, share: float, cross: Cross = "paint") -> IdealEditor:
+        """The editor of these views."""
         return IdealEditor(self.views, share, cross)
 
     def truth(self, view: str) -> PartTruth:

@@ -146,16 +146,6 @@ def test_an_editor_with_a_favourite_is_not_ideal(records, tmp_path, monkeypatch)
     assert report_of("ideal").problems(written_runs.results(study, [sound])) == []
 
 
-@pytest.mark.parametrize("cross", ["paint", "joint"])
-def test_the_twins_page_says_what_holds_by_construction(records, tmp_path, cross):
-    data = records["full"].to_json()
-    ideal = {**data["spec"]["editor"]["ideal"], "cross": cross}
-    data = {**data, "spec": {**data["spec"], "editor": {"ideal": ideal}}}
-    one = written_runs.outcome("ideal", "spheres", ["full"], data, "one")
-    (section,) = report_of("ideal").sections(written_runs.results(STUDY, [one]), Layout(tmp_path))
-    assert ("it says by construction" in " ".join(section.text)) == (cross == "joint")
-
-
 def test_a_run_whose_editor_is_not_ideal_ends_with_3(tmp_path, monkeypatch):
     def collapsed(*_):
         return Alone(0.1, (0.98, 0.01, 0.01), 0.96)

@@ -38,14 +38,13 @@ class IdealPart(Part):
     """The ideal editor (docs/measuring/ideal-editor.md).
 
     ``parts`` of the thing, each in one of ``colors``; ``settled``: mean share of the steps until
-    an answer holds; ``cross``: output of cross-attention, or "joint" for its twin with joint
-    attention on a flow.
+    an answer holds; ``cross``: output of cross-attention.
     """
 
     parts: Annotated[Whole, Field(ge=1, le=1000)] = 12
     colors: Annotated[Whole, Field(ge=1, le=12)] = 4
     settled: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    cross: Literal["paint", "word", "swapped", "joint"] = "paint"
+    cross: Literal["paint", "word", "swapped"] = "paint"
 
 
 class EditorPart(Part):

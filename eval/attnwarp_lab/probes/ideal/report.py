@@ -124,14 +124,6 @@ class IdealReport(EditorReport):
             ),
             *self.problems(results),
         ]
-        if any(
-            record.spec["editor"]["ideal"]["cross"] == "joint"
-            for _, record in results.finished(self.name)
-        ):
-            text.append(
-                "With joint attention it judges geometry alone: what it says of blocks, keys or"
-                " positions it says by construction."
-            )
         yield Section("The ideal editor", text, [Table(columns, rows)], folded=True)
         if any("drift" in record.spec for _, record in results.finished(self.name)):
             yield _drift(results, layout)

@@ -28,7 +28,7 @@ from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.shared.edit_truth import EditTruth, answers_of
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
-from attnwarp_eval.study.shared.edits import MethodProbe, editor_of, noise_seed
+from attnwarp_eval.study.shared.edits import MethodProbe, noise_seed
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.pictures import jpeg
 from attnwarp_eval.study.shared.splats import splats_of
@@ -37,7 +37,7 @@ from attnwarp_lab.ideal.figures import part_answers
 from attnwarp_lab.ideal.places import Places
 from attnwarp_lab.ideal.shape_figures import ShapeTruth, depth_figures, shape_figures
 from attnwarp_lab.ideal.share import alone, solve_share
-from attnwarp_lab.probes.ideal.measure import EditorResult
+from attnwarp_lab.probes.ideal.measure import EditorResult, with_ideal_editor
 
 Image = npt.NDArray[np.float32]
 
@@ -88,15 +88,8 @@ class ShapeProbe(MethodProbe[ShapeResult]):
     metrics = metrics_of("shape.")
 
     def check(self, study: Study) -> None:
-        """Require the ideal editor of one kind for every variant."""
-        for name in study.probes.get(self.name, []):
-            variant = study.variants[name]
-            ideal = editor_of(study, variant).ideal
-            if ideal is None or ideal.cross == "joint":
-                raise ValueError(
-                    f"probes.{self.name}: {name!r} has no ideal editor of a UNet; give it editor:"
-                    " {ideal: {}}"
-                )
+        """Require the ideal editor of all variants, and true geometry of the scene after."""
+        for name, variant in with_ideal_editor(study, self.name):
             if variant.part(ShapeVariantPart).scene_after and variant.geometry != "truth":
                 raise ValueError(
                     f"variants.{name}: scene_after without true geometry; add geometry: truth"
