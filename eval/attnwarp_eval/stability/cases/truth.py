@@ -116,7 +116,7 @@ def _ball_scene(radius: float, card: float) -> Scene:
     """A ball at the origin, seen by the source along x and by a target along y.
 
     Args:
-        radius: of the ball, 0 for none.
+        radius: radius of the ball, 0 for none.
         card: half the side of a square before the target, half way to the ball; 0 for none.
     """
     there = {"wall": True, "card": card > 0, "ball": radius > 0}

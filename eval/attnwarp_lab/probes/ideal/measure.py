@@ -7,8 +7,8 @@ Views of a record are named ``parts/view``. Figures end in ``.edit`` for the edi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +18,13 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.schema import Study
 from attnwarp_eval.study.shared.drifts import DriftPart
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import Donor
 from attnwarp_eval.study.shared.edits import (
     MethodProbe,
     VariantPart,
-    editor_of,
     noise_seed,
 )
 from attnwarp_eval.study.shared.method_run import other_world, own_seconds, run_method
@@ -37,6 +36,7 @@ from attnwarp_lab.ideal.edges import EdgesPart, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.figures import fill_figures, part_answers, part_figures
 from attnwarp_lab.ideal.paint import EDIT
+from attnwarp_lab.ideal.recorded import EditorResult, with_ideal_editor
 from attnwarp_lab.ideal.share import alone, solve_share
 from attnwarp_lab.ideal.thing import Thing, in_front
 
@@ -44,38 +44,6 @@ Image = npt.NDArray[np.float32]
 
 UNABLE = ("dge", "gaussctrl", "fused")
 """Methods that need an editor's attention or guidance, neither of which the ideal editor has."""
-
-
-@dataclass(frozen=True)
-class EditorResult:
-    """Entries of a cell's record on the ideal editor, besides the figures of its views.
-
-    Attributes:
-        share: share of signal, solved from the editor's ``settled``.
-        settled, frequencies, agreement: settled, frequencies and agreement of views edited alone,
-            :class:`attnwarp_lab.ideal.share.Alone`.
-        fault: reason why the editor is not ideal; None if it is ideal.
-        answers: answers of each part or place in the source's edit, -1 where it shows none.
-    """
-
-    entry: ClassVar[str]
-    share: float
-    settled: float
-    frequencies: tuple[float, ...]
-    agreement: float
-    fault: str | None
-    answers: tuple[int, ...]
-
-    def to_json(self) -> Json:
-        """The record's entry."""
-        return {self.entry: asdict(self)}
-
-    @classmethod
-    def from_json(cls, data: Json) -> Self:
-        """Rebuild from the record."""
-        own = data[cls.entry].items()
-        given: Json = {key: tuple(of) if isinstance(of, list) else of for key, of in own}
-        return cls(**given)
 
 
 @dataclass(frozen=True)
@@ -90,20 +58,6 @@ class IdealResult(EditorResult):
     entry = "ideal"
     part_share: float
     edited: int
-
-
-def with_ideal_editor(study: Study, probe: str) -> Iterator[tuple[str, Variant]]:
-    """Variants of a probe by name, each of which must have the ideal editor.
-
-    Raises:
-        ValueError: a variant has another editor.
-    """
-    for name in study.probes.get(probe, []):
-        if editor_of(study, study.variants[name]).ideal is None:
-            raise ValueError(
-                f"probes.{probe}: {name!r} has no ideal editor; give it editor: {{ideal: {{}}}}"
-            )
-        yield name, study.variants[name]
 
 
 @register

@@ -10,10 +10,11 @@ from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.statistics.contrasts import paired
 from attnwarp_eval.statistics.intervals import interval, over_scenes
-from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, register_report
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
 from attnwarp_lab.ideal.edges import edges_of
+from attnwarp_lab.ideal.report import EditorReport
 
 MOST_STAGES = 3
 """Stages of an edit that the figure on depth edges shows."""
@@ -27,25 +28,6 @@ DRIFTING = {
     ),
 }
 """Probes of methods whose editor drifts: the editor, what is shown, and its metric."""
-
-
-class EditorReport(ProbeReport):
-    """What reports of edits by the ideal editor share: the cost, and editors that are not ideal."""
-
-    cost = "whole"
-    cost_of = "an edit"
-    cost_text = "Seconds are those of one whole edit of a scene by the ideal editor, with tuning."
-
-    def problems(self, results: Results) -> list[str]:
-        """Editors that are not ideal: they have favourite answers, or agree without features."""
-        variants: dict[tuple[str, str], list[str]] = {}
-        for cell, record in results.finished(self.name):
-            if record.extra.fault is not None:
-                variants.setdefault((cell.scene, record.extra.fault), []).extend(cell.variants)
-        return [
-            f"{scene}: not ideal in {', '.join(names)}: {fault}"
-            for (scene, fault), names in sorted(variants.items())
-        ]
 
 
 @register_report

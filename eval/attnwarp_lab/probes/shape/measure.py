@@ -35,9 +35,9 @@ from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.world import World
 from attnwarp_lab.ideal.figures import part_answers
 from attnwarp_lab.ideal.places import Places
+from attnwarp_lab.ideal.recorded import EditorResult, with_ideal_editor
 from attnwarp_lab.ideal.shape_figures import ShapeTruth, depth_figures, shape_figures
 from attnwarp_lab.ideal.share import alone, solve_share
-from attnwarp_lab.probes.ideal.measure import EditorResult, with_ideal_editor
 
 Image = npt.NDArray[np.float32]
 

@@ -18,7 +18,7 @@ from attnwarp_eval.study.probe_report import (
 )
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.edits import VariantPart
-from attnwarp_lab.probes.ideal.report import EditorReport
+from attnwarp_lab.ideal.report import EditorReport
 from attnwarp_lab.probes.shape.measure import KINDS
 
 BY_KIND = {
@@ -89,9 +89,10 @@ class ShapeReport(EditorReport):
             rows = [[n, *mean_values(results, self.name, n, columns.values())] for n in names]
             tables.append(Table([kind, *columns], rows, folded=True))
         shares = Table(["share of the gain", *GAINS.values()], [*_shares(results)])
-        yield Section(
-            "By angle, and wrong features", [TOLD_ANGLE], [_by_yaw(results, names), shares]
-        )
+        first = results.study.ablations[:1]
+        shown = [name for table in first for name in (table.baseline, *table.variants)] or names
+        angles = _by_yaw(results, [name for name in shown if name in measured])
+        yield Section("By angle, and wrong features", [TOLD_ANGLE], [angles, shares])
         yield Section("Kinds of edits", [TOLD], tables)
 
 
