@@ -65,8 +65,8 @@ AnywayOption = Annotated[
 EditorOption = Annotated[
     str,
     option(
-        "Edit by this editor: a bundled one, small-plain or small-depth, or a folder in diffusers'"
-        " format; two folders, BASE,CONTROLNET, edit by depth.",
+        "Edit by this editor: a bundled one, small-plain, small-parts or small-depth, or a"
+        " folder in diffusers' format; two folders, BASE,CONTROLNET, edit by depth.",
         "NAME|FOLDER",
     ),
 ]

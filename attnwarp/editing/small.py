@@ -45,7 +45,7 @@ def bundled() -> list[str]:
 
     Example:
         >>> bundled()
-        ['small-depth', 'small-plain']
+        ['small-depth', 'small-parts', 'small-plain']
     """
     return sorted(path.parent.name for path in WEIGHTS.glob("*/model_index.json"))
 
@@ -104,6 +104,7 @@ JOINING = {
     *("a", "an", "the", "it", "its", "this", "that", "these", "those", "all", "some", "my", "our"),
     *("and", "or", "of", "to", "into", "in", "on", "at", "by", "for", "from", "with", "as", "like"),
     *("is", "are", "be", "has", "have", "so", "please", "make", "turn", "give", "more", "very"),
+    *("each", "every", "part", "parts"),
 }
 """Words that join an instruction's others, so they are never named as unknown."""
 

@@ -27,6 +27,7 @@ from attnwarp.editing.layers import Kind
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.io.file import write_atomically
 from attnwarp.methods.algorithms.attention_warping import AttentionWarpingSettings, a_t, inject
+from attnwarp.methods.noise import carried as carried_order
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from attnwarp_eval.colors import to_linear, to_srgb
 from training.editors.parts import SENTENCES, PartsPool
@@ -244,6 +245,13 @@ def noise_of(cases: list[int], number: int) -> Tensor:
     )
 
 
+def tied_to(noise: Tensor, warp: Any) -> Tensor:
+    """(48, h, w) noise of a target that has the source's noise where both see the surface."""
+    seen = warp.at(tuple(noise.shape[1:]))
+    order = carried_order(seen.correspondence.xy, seen.mask)
+    return noise.flatten(1)[:, order.flatten()].view_as(noise)
+
+
 def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = True) -> Marks:
     """All marks on some worlds: of a first view alone, of its features in runs from other noise, and of them in the second view."""
     marks: Marks = {}
@@ -275,7 +283,7 @@ def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = 
         mixed[k] = torch.where(inside, noise_a[k], noise_b[k])
     run_b, run_m = run(sources, noise_b), run(sources, mixed)
     same: dict[str, list[Image]] = {}
-    other = {"alone": run(targets, noise_t)} if carried else {}
+    other: dict[str, list[Image]] = {}
     if carried:
         for kind in ("self", "cross", "both"):
             kinds = KINDS if kind == "both" else (kind,)
@@ -287,9 +295,13 @@ def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = 
                 same[kind] = run(sources, noise_b)
         warps = [cases.warp(c) for c in targets]
         mirrored = [Mirrored(w) for w in warps]
-        for key, used, settings in (
-            ("both linear", warps, LINEAR), ("both late", warps, LATE), ("by kind", warps, BY_KIND),
-            ("mirrored", mirrored, BY_KIND),
+        tied = torch.stack([tied_to(n, w) for n, w in zip(noise_a, warps, strict=True)])
+        other["alone"] = run(targets, noise_t)
+        other["alone, noise on the surface"] = run(targets, tied)
+        for key, used, settings, noise in (
+            ("both linear", warps, LINEAR, noise_t), ("both late", warps, LATE, noise_t),
+            ("by kind", warps, BY_KIND, noise_t), ("mirrored", mirrored, BY_KIND, noise_t),
+            ("by kind, noise on the surface", warps, BY_KIND, tied),
         ):  # fmt: skip
             with ExitStack() as stack:
                 for kind in KINDS:
@@ -298,7 +310,7 @@ def part_marks(editor: Any, cases: Cases, worlds: list[int], *, carried: bool = 
                     stack.enter_context(
                         inject(editor, recording, warps=used, weight=weight, layers=layers)
                     )
-                other[key] = run(targets, noise_t)
+                other[key] = run(targets, noise)
     for k, c in enumerate(sources):
         outside = cases.masks[c][0]
         psnr = -10 * np.log10(

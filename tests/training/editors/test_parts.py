@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -108,6 +112,22 @@ def test_a_control_that_turns_one_of_two_parts_of_every_world_has_half_of_the_ga
     }
     share = share_of_gain(marks, "control", "carried", "alone")
     assert (share.value, share.low, share.high, share.count) == (0.5, 0.5, 0.5, 10)
+
+
+def test_the_card_of_small_parts_says_what_its_answers_say():
+    folder = Path(__file__).parents[3]
+    batches = json.loads((folder / "reports" / "editor" / "parts.json").read_text()).values()
+    card = (folder / "attnwarp" / "editing" / "weights" / "small-parts" / "card.md").read_text()
+    means = {}
+    for key in next(iter(batches)):
+        right = [value for batch in batches for value, _ in batch[key]]
+        means[key] = sum(right) / len(right)
+        shown = rf"^\| {re.escape(key)} \| \*\*{100 * means[key]:.0f} %\*\* .* \| {len(right)} \|$"
+        assert re.search(shown, card, re.MULTILINE), key
+    arms = (f"other view, {arm}: the source's answer" for arm in ("alone", "mirrored", "by kind"))
+    alone, mirrored, carried = (means[arm] for arm in arms)
+    share = 100 * (mirrored - alone) / (carried - alone)
+    assert f'over "alone" | **{share:.0f} %**' in card
 
 
 @pytest.mark.slow
