@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from attnwarp_eval.statistics.contrasts import contrast
+
 ROOT = Path(__file__).parents[3]
 README = " ".join((ROOT / "README.md").read_text().split())
 SEEN = ("ideal", "parts.seen.edit")
@@ -288,6 +290,40 @@ def harmonics():
     costs = [ratio("depth.abs_rel", scene) for scene in scenes]
     yield f"0.25 saves {saved:.0f} % of the CPU seconds of 2,000 iterations"
     yield "depth error {:.0f} and {:.0f} % larger".format(*costs)
+
+
+def default_of_an_edit():
+    """What half of an edit's steps, and of its tuning, loses."""
+
+    def loss(metric, first, second, *studies):
+        a, b = (
+            {
+                (study, scene): {"": value}
+                for study in studies
+                for scene, value in by_scene(
+                    study, "ideal", f"parts.delta_e.{metric}", each
+                ).items()
+            }
+            for each in (first, second)
+        )
+        return contrast(a, b, "plain")
+
+    studies = ("default-reported", "steps-reported")
+    several = [f"several answers: {n} steps" for n in (20, 10)]
+    both, first = loss("edit", *several, *studies), loss("edit", *several, studies[0])
+    said = "{:.2f} dE00 [{:.2f}, {:.2f}]"
+    yield f"on {both.scenes} drawn scenes"
+    yield f"by {said.format(*both.shown(0.9))} with several right answers"
+    yield f"on the first {first.scenes} it was {said.format(*first.shown(0.9))}"
+    one = loss("edit", *(f"one answer: {n} steps" for n in (20, 10)), studies[0])
+    yield f"by {one.shown(0.9)[0]:.2f} with one"
+    tuned = "several answers: 20 steps, tuned", "several answers: 10 steps, tuned half as long"
+    yield f"renders by {said.format(*loss('render', *tuned, studies[0]).shown(0.9))}"
+
+
+def test_the_page_on_time_prints_what_the_default_of_an_edit_loses():
+    told = " ".join((ROOT / "docs/measuring/accuracy-and-time.md").read_text().split())
+    assert [phrase for phrase in default_of_an_edit() if phrase not in told] == []
 
 
 @pytest.mark.parametrize("topic", [iterations, harmonics])
