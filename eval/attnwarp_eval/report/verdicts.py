@@ -74,12 +74,20 @@ def verdicts(folder: Path) -> list[Judged]:
         one.claim.id: one
         for one in judged(
             one
-            for name, (_, results) in studies.items()
-            for one in measured(results, [c for c in load_claims() if c.study == name])
+            for _, results in studies.values()
+            for one in measured(results, [c for c in load_claims() if _judges(results, c)])
         )
         if one.claim is not None
     }
     return [_judged(claim, by_claim.get(claim.id), studies) for claim in load_claims()]
+
+
+def _judges(results: Results, claim: Claim) -> bool:
+    """Return True if these are results of the study and the scenes that were declared."""
+    drawn = results.study.population
+    of = claim.scenes
+    same = drawn is not None and of is not None and drawn.seed == of["seed"]
+    return same and claim.study == results.study.name
 
 
 def _judged(

@@ -190,6 +190,20 @@ def test_sides_that_are_equal_to_the_last_digit_were_not_tried(tmp_path, slip_de
     assert claim_row(one)[1] == "can't tell: both sides are equal to the last digit"
 
 
+def test_a_run_of_the_study_on_other_scenes_than_were_declared_judges_nothing(
+    tmp_path, slip_declared
+):
+    path = tmp_path / "suite" / "results.jsonl.xz"
+    store = written(tmp_path / "run", SCENES, [2.0] * 8)
+    assert invoke("report", store.root, "--no-pictures", "--raw", path).exit_code == 0
+    head, *cells = lzma.decompress(path.read_bytes()).decode().splitlines()
+    for seed, told in ((1010, "holds"), (1011, "not measured: `suite` judges it")):
+        study = json.loads(head)
+        study["study"]["population"]["seed"] = seed
+        path.write_bytes(lzma.compress("\n".join([json.dumps(study), *cells]).encode()))
+        assert table(verdicts(tmp_path), tmp_path).rows[0][1] == told
+
+
 def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
     runs = [written(tmp_path / name, SCENES, [2.0] * 8, name=name) for name in ("suite", "fitted")]
     parts = [read_results(store) for store in runs]
