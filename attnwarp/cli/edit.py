@@ -38,7 +38,6 @@ from attnwarp.cli.options import (
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads, warned
-from attnwarp.editing.small import bundled as bundled_editors
 from attnwarp.editing.small import check_words, guide_of, own_steps_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
@@ -47,7 +46,7 @@ DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_siz
 """Fields of `Editing` that decide the result of an edit."""
 
 FEWER_STEPS = 10
-"""Steps of `extended` by a bundled editor: as near to the wanted edit as its own 20."""
+"""Steps of `extended` by small-plain: as near to the wanted edit as its own 20."""
 
 
 @options_of(Editing, Reading)
@@ -115,8 +114,8 @@ def edit(
     steps: Annotated[
         int | None,
         of_method(
-            "Denoise in so many steps (default: the editor's own number; with extended a bundled"
-            " editor takes 10).",
+            "Denoise in so many steps (default: the editor's own number; with extended"
+            " small-plain takes 10).",
             "N",
             min=1,
         ),
@@ -271,7 +270,7 @@ def edit(
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
         if method == "attention_warping" and preset is None:
             preset = "extended"  # carries most; the library's default is the method as corrected
-        fewer = preset == "extended" and editor in bundled_editors()
+        fewer = preset == "extended" and editor == "small-plain"
         changes.setdefault("steps", FEWER_STEPS if fewer else own_steps_of(editor))
         settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)

@@ -779,10 +779,11 @@ def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
         ("small-plain", ("--preset", "corrected"), 20),
         ("small-plain", ("--method", "by_view"), 20),
         ("small-plain", ("--steps", "7"), 7),
+        ("small-depth", (), 20),  # nobody has measured fewer of it
         (None, (), 20),  # Stable Diffusion's published number
     ],
 )
-def test_extended_takes_half_of_a_bundled_editors_steps_and_all_else_its_own_number(
+def test_extended_takes_half_of_the_steps_of_small_plain_and_all_else_its_own_number(
     place, tmp_path, monkeypatch, editor, more, steps
 ):
     def chosen(method, preset, **changes):
