@@ -1,5 +1,7 @@
 """The probe of edits that change shapes. Oracles: true pictures, whose figures are known; the file's own edits."""
 
+import json
+import lzma
 from pathlib import Path
 
 import numpy as np
@@ -109,3 +111,19 @@ def test_a_stage_of_a_seeded_tuning_begins_with_splats_on_what_is_new():
     assert len(away) > 100 and np.quantile(away, 0.1) > 0.4 and np.median(away) < 0.6
     # A pixel 4 away is 0.07 wide; a splat as large as the gap to others would hide the floor.
     assert after.scales[len(floor) :].max() < 0.1
+
+
+def test_the_committed_page_has_the_overlap_by_angle_of_its_raw_results():
+    folder = Path(__file__).parents[3] / "reports/shape"
+    text = lzma.decompress((folder / "results.jsonl.xz").read_bytes()).decode()
+    values = [
+        view["metrics"].get("shape.overlap.several")
+        for line in map(json.loads, text.splitlines())
+        if line.get("record") and line["cell"]["variants"] == ["default"]
+        for view in line["record"]["views"]
+        if view["name"] == "yaw030"
+    ]
+    mean = np.mean([value for value in values if value is not None])
+    table = (folder / "report.md").read_text().partition("| overlap | 10° | 30° |")[2]
+    (row,) = (line for line in table.splitlines() if line.startswith("| default |"))
+    assert float(row.split("|")[3].split()[0]) == pytest.approx(mean, abs=1e-3)
