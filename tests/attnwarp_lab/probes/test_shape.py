@@ -121,7 +121,7 @@ def test_the_committed_page_has_the_overlap_by_angle_of_its_raw_results():
         for line in map(json.loads, text.splitlines())
         if line.get("record") and line["cell"]["variants"] == ["default"]
         for view in line["record"]["views"]
-        if view["name"] == "yaw030"
+        if view["view"] == "yaw030"
     ]
     mean = np.mean([value for value in values if value is not None])
     table = (folder / "report.md").read_text().partition("| overlap | 10° | 30° |")[2]
