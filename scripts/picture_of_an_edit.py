@@ -19,7 +19,7 @@ from attnwarp_eval.world import splats, world
 
 VIEWS = ("yaw030", "yaw060", "yaw090", "yaw120")
 SIZE = 128
-"""Side of the pictures; the bundled editor `small-plain` was trained at this size."""
+"""Side of the pictures."""
 
 
 def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None:
@@ -34,7 +34,7 @@ def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None
     number = truth.scene.object_names.index(thing)
     segments = [truth.geometry.trace(camera).object_id == number for camera in cameras]
     model = splats(scene, SIZE, 0, kind="2d", count=20_000, position_noise=0.1, normal_noise=3.0)
-    given = (model, cameras, before, load_editor("small-plain"), instruction)
+    given = (model, cameras, before, load_editor("small-parts"), instruction)
     # The row shows edited views, so the splats need no tuning.
     few: dict[str, Any] = {"iterations": 1, "seed": seed}
     rows: dict[str, Mapping[int, Any]] = {
@@ -69,7 +69,7 @@ if __name__ == "__main__":
     parser.add_argument("out", type=Path)
     parser.add_argument("--scene", default="bear")
     parser.add_argument("--thing", default="bear")
-    parser.add_argument("--instruction", default="make the bear another color")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--instruction", default="make each part another color")
+    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     draw(options.out, options.scene, options.thing, options.instruction, options.seed)

@@ -97,7 +97,7 @@ def redrawn(count: int) -> npt.NDArray[np.int64]:
 
 
 def share_of_gain(marks: Marks, control: str, arm: str, alone: str) -> Figure:
-    """What a control gains over views alone, as a share of what an arm gains over them on the same parts."""
+    """Gain of a control over views alone, as a share of an arm's gain over them on the same parts."""
     worlds = np.array([w for _, w in marks[alone]])
     sums = np.array([[v for v, _ in marks[key]] for key in (control, arm, alone)])
     table = np.array([sums[:, worlds == w].sum(axis=1) for w in np.unique(worlds)])

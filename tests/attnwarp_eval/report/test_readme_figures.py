@@ -293,7 +293,7 @@ def harmonics():
 
 
 def default_of_an_edit():
-    """What half of an edit's steps, and of its tuning, loses."""
+    """Loss by half of the steps, and of the tuning, of an edit."""
 
     def loss(metric, first, second, *studies):
         a, b = (

@@ -128,6 +128,14 @@ def test_the_card_of_small_parts_says_what_its_answers_say():
     alone, mirrored, carried = (means[arm] for arm in arms)
     share = 100 * (mirrored - alone) / (carried - alone)
     assert f'over "alone" | **{share:.0f} %**' in card
+    readme = " ".join((folder / "README.md").read_text().split())
+    for arm, place in (
+        ("alone", "of the cases alone"),
+        ("alone, noise on the surface", "with noise on the surface alone"),
+        ("by kind, noise on the surface", "carried by the default's weights with that noise"),
+    ):
+        share = means[f"other view, {arm}: the source's answer"]
+        assert f"in {100 * share:.0f} % {place}" in readme
 
 
 @pytest.mark.slow
