@@ -60,7 +60,8 @@ def verdicts(folder: Path) -> list[Judged]:
     parts: dict[str, list[tuple[Path, Results]]] = defaultdict(list)
     for path in sorted(folder.rglob(PARTS)):
         results = read_raw(path)
-        parts[results.study.name].append((path, results))
+        if any(claim.study == results.study.name for claim in load_claims()):
+            parts[results.study.name].append((path, results))
     studies: dict[str, tuple[Path, Results]] = {}
     for name, own in parts.items():
         folders = {path.parent for path, _ in own}
