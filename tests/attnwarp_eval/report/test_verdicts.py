@@ -204,7 +204,7 @@ def test_a_run_of_the_study_on_other_scenes_than_were_declared_judges_nothing(
         assert table(verdicts(tmp_path), tmp_path).rows[0][1] == told
 
 
-def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
+def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path, slip_declared):
     runs = [written(tmp_path / name, SCENES, [2.0] * 8, name=name) for name in ("suite", "fitted")]
     parts = [read_results(store) for store in runs]
     with pytest.raises(InputError, match="parts differ in name"):
