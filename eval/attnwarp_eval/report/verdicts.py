@@ -134,7 +134,10 @@ def headlines(claims: list[Judged]) -> list[str]:
     for number, each in enumerate((e for e in chosen if e.comparison is not None), 1):
         one = each.comparison
         assert one is not None
-        verdict, reason = claim_verdict(one), f" ({one.reason})" if one.reason else ""
+        verdict, why = claim_verdict(one), one.reason
+        if verdict == "blind":
+            why = "features from a wrong place do as well"
+        reason = f" ({why})" if why else ""
         text = each.claim.plain or each.claim.text
         difference = f"{_plainly(one)}, over {one.contrast.scenes} scenes"
         told = f"{verdict[0].upper()}{verdict[1:]}{reason}: {difference}."

@@ -249,12 +249,12 @@ def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict
         # Half of the planned scenes is not finished.
         every = judged(dataclasses.replace(each, word="") for each in one)
         halves.append({each.claim.text: each.word for each in every})
-    assert halves[0].keys() == halves[1].keys() and len(halves[0]) > 2
+    assert halves[0].keys() == halves[1].keys() and len(halves[0]) > 10
     opposite = {"better", "worse"}
     pairs = {text: {word, halves[1][text]} for text, word in halves[0].items()}
     assert [text for text, pair in pairs.items() if pair == opposite] == []
     agreeing = [text for text, pair in pairs.items() if len(pair & opposite) == len(pair) == 1]
-    assert agreeing  # the halves do tell
+    assert len(agreeing) > 3  # the halves do tell
 
 
 def test_of_200_simulated_runs_of_equal_arms_few_judge_and_no_interval_disagrees(
