@@ -139,7 +139,7 @@ class PartsUNet(EditUNet):
             torch.nn.Softmax(dim=-1),
             torch.nn.Linear(ANSWERS, text),
         )
-        self.register_buffer("hues", torch.zeros(HUES, 3))
+        self.register_buffer("hues", torch.zeros(HUES, 3, dtype=torch.float32))
         for name, module in self.named_modules():
             if name.endswith("attn2"):
                 module.register_forward_hook(self._add)
