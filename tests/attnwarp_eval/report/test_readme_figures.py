@@ -118,7 +118,10 @@ def masks_and_fits():
         *hidden
     )
     yield f"over {scenes} drawn scenes"
-    yield f"labels through fitted 2DGS and 3DGS, on {scenes_of('fitted')} drawn scenes"
+    for metric in ("depth.abs_rel", "depth.normal_mean"):
+        flat, solid = (by_scene("fitted", "fit", metric, f"{k}DGS fit") for k in (2, 3))
+        assert np.mean([*flat.values()]) < np.mean([*solid.values()])
+    yield f"closer through fitted 2DGS than through fitted 3DGS, on {scenes_of('fitted')} drawn"
     yield f"let in and throw away, on {scenes_of('visibility')} drawn scenes"
     fits = lines("iterations")[0]["study"]["variants"]
     few, most = (f(one["fit"]["iterations"] for one in fits.values()) for f in (min, max))
