@@ -23,10 +23,10 @@ SIZE = 128
 
 
 def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None:
-    """Rows: before the edit; each view edited alone, attention warped, and the weights and mask of
-    `extended`, all with noise of each view's own; and each view alone with the noise of `extended`,
-    which sticks to the surface. Columns: the source view and targets. Nothing changes outside the
-    thing's exact mask.
+    """Rows: before the edit; each view edited alone and attention warped, with noise of each view's
+    own; each view alone with noise that sticks to the surface, and with it the preset `extended`,
+    the default. Columns: the source view and targets. Nothing changes outside the thing's exact
+    mask.
     """
     truth = world(scene, SIZE)
     cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
@@ -47,8 +47,8 @@ def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None
     alone = {"a0": 0.0, "unseen": "free"}
     for title, settings in (
         ("attention warped", preset("attention_warping", "corrected", noise="fresh", **few)),
-        ("extended's weights", preset("attention_warping", "extended", noise="fresh", **few)),
         ("alone, surface noise", preset("attention_warping", "extended", **few, **alone)),
+        ("the default", preset("attention_warping", "extended", **few)),
     ):
         rows[title] = attention_warping(*given, settings, segments=segments).edited
     figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 11.2), dpi=80)
