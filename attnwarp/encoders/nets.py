@@ -1,5 +1,5 @@
-"""Networks of the bundled encoders, small enough for a CPU; the recipes in eval/training/ train
-them.
+"""Networks of the bundled encoders, small enough for a CPU; eval/training/README.md says
+what trained them.
 
 Inputs are pictures (N, 3, H, W) sRGB in [0, 1]; each network centres its input.
 """

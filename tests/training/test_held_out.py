@@ -1,20 +1,17 @@
-"""Pictures, words and shapes that no recipe may show a network. Oracles: the scenes' own files, patterns of words, counts."""
+"""Pictures, words and shapes that no recipe may show a network. Oracles: the scenes' own files, counts."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 
 import attnwarp_eval
-from attnwarp_eval.drawn import worlds
 from attnwarp_eval.drawn.assemblies import KINDS
 from attnwarp_eval.drawn.objects import RECIPES, body, plain_numbers
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES, OBJECTS, Look, held_out
 from attnwarp_eval.scene.yaml import read_yaml
-from training.worlds import editing_pairs, words
+from training.worlds import editing_pairs
 from training.worlds.assemblies import Assembly
-from training.worlds.data import SPLITS
-from training.worlds.draw import HELD_OUT_SHAPE, TRAIN_SHAPES, attributes, draw_look
+from training.worlds.draw import HELD_OUT_SHAPE, TRAIN_SHAPES, draw_look
 from training.worlds.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -25,9 +22,7 @@ from training.worlds.editing_pairs import (
     instruction,
     reserved,
 )
-from training.worlds.part_pictures import PART_SPLITS
 from training.worlds.recolors import RECOLOR_SPLITS
-from training.worlds.words import captioned, sentence
 
 SHAPE = ("center", "radii", "start", "end", "points", "radius", "height", "size")
 
@@ -58,7 +53,7 @@ def test_no_instruction_of_the_scenes_is_ever_drawn():
 
 
 def test_worlds_and_shapes_of_training_and_tests_do_not_meet():
-    groups = (SPLITS, PAIR_SPLITS, PART_SPLITS, RECOLOR_SPLITS)
+    groups = (PAIR_SPLITS, RECOLOR_SPLITS)
     seeds = [set(range(s.first, s.first + s.worlds)) for group in groups for s in group.values()]
     assert len(set.union(*seeds)) == sum(len(s) for s in seeds)
     shapes = [
@@ -103,58 +98,3 @@ def test_no_recipe_repeats_a_scenes_shape_or_texture():
     for finish in ("plain", "wooden", "stone"):
         surface = Look(FINISHES.index(finish), 0, -1, 0, 3, 11).surface
         assert str(surface.get("texture", {}).get("colors")) not in palettes - {"None"}
-
-
-LEARNT = {
-    *(f"a photo of a {c} bear in a garden" for c in ("blue", "green", "red", "violet", "yellow")),
-    "a photo of an orange bear in a garden", "a photo of a bronze statue of a bear in a garden",
-    *(f"a photo of a {c} stegosaurus" for c in ("blue", "pink", "red", "yellow")),
-    "a photo of a green stegosaurus in a clearing", "a photo of a steel sculpture of a stegosaurus in a clearing",
-    "a photo of a stone statue of a stegosaurus in a clearing",
-    "a photo of a bronze bust of a man", "a photo of a marble bust of a man",
-    "a photo of a person in a park", "a photo of a person in a park by day",
-    "a photo of a person in a park on a moonlit night", "a photo of a golden statue of a person in a park",
-    "a photo of a table in a garden at dusk", "a photo of a table in a garden by day",
-    "a photo of a white marble table in a garden", "a photo of a wooden table in a garden",
-    "a photo of a tree stump in the snow",
-}  # fmt: skip
-"""The scenes' sentences that captions of worlds can be, word for word: clip-small and clip-parts may
-have learnt from them."""
-
-
-def captions_pattern():
-    """A regular expression of all captions, from the tables of words alone."""
-
-    def one(words):
-        return f"(?:{'|'.join(sorted(map(re.escape, words), key=len, reverse=True))})"
-
-    def every(table):
-        return one(word for words in table.values() for word in words)
-
-    hue = every(words.HUES)
-    surface = (
-        f"(?:{hue}|(?:shiny|glossy|polished) {hue}|{hue} plastic|{hue} and {hue}"
-        " (?:striped|checked|chequered)|golden|gold|silver|steel|chrome|bronze|copper|wooden|stone"
-        "|(?:white )?marble)"
-    )
-    nouns = f"(?:{every(words.NOUNS)}|thing|object|something|polar bear|grizzly bear)"
-    place, hour = every(worlds.PLACES), every(worlds.HOURS)
-    return re.compile(
-        f"(?:{one(o for o in words.OPENINGS if o)} )?an? (?:{one(words.FILLERS)} )?(?:{surface} )?"
-        f"(?:(?:statue|sculpture) of an? )?{nouns}(?: {hour})?(?: {place})?(?: {hour})?"
-    )
-
-
-def test_captions_repeat_no_sentence_of_the_scenes_but_these():
-    pattern, rng = captions_pattern(), np.random.default_rng(0)
-    for _ in range(2000):
-        thing = int(rng.integers(len(OBJECTS)))
-        look = draw_look(thing, rng, pairs="any")
-        text = sentence(captioned(attributes(thing, look), rng), rng, fillers=True)
-        assert pattern.fullmatch(text), text
-    edits = [e for scene in scenes() for e in scene.get("edits", ())]
-    told = [*edits, *(answer for e in edits for answer in e.get("answers", ()))]
-    descriptions = {e[key].lower() for e in told for key in ("source", "target") if key in e}
-    theirs = reserved() | descriptions
-    assert len(theirs) > 100
-    assert {text for text in theirs if pattern.fullmatch(text)} == LEARNT

@@ -1,6 +1,8 @@
-"""Each recipe of a bundled weight file, from pictures to the exported file. Oracles: diffusers' own pipelines, the
+"""The recipe of small-plain, from pictures to the exported file. Oracles: diffusers' own pipelines, the
 networks that were trained, a run that was not stopped.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,29 +13,16 @@ from typer.testing import CliRunner
 
 from attnwarp.editing.editor import edit
 from attnwarp.editing.small import load_editor
-from attnwarp.encoders import bundled
-from attnwarp.encoders.nets import ClipParts, ClipSmall, PerceptualSmall
 from attnwarp.errors import InputError
-from attnwarp_eval.drawn.assemblies import KINDS
-from attnwarp_eval.drawn.worlds import COLORS, GROUNDS, OBJECTS
-from attnwarp_eval.encoders import dino_small
 from training import steps
 from training.editors import draws
 from training.editors.__main__ import app
 from training.editors.export import export_editor
 from training.editors.pool import PairPool
 from training.editors.recipe import Stage, make_tokenizer, train_stage
-from training.encoders import clip, clip_parts, dino, naming, perceptual
-from training.encoders.__main__ import export
-from training.worlds import part_pictures
-from training.worlds.data import Pictures
 from training.worlds.editing_pairs import LOOKS, PAIR_SPLITS, SIZE, THING, Worlds, edit_looks
-from training.worlds.part_pictures import GROUND, PARTS, SKY, PartPictures
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
-
-
-# Editors --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +79,8 @@ def test_small_plain_is_trained_stopped_gone_on_with_and_edits_in_diffusers(
     train_stage("drawn", out, out, stage=drawn, pool=pool)
     again = torch.load(out / "drawn.pt", weights_only=True)["average"]
     assert all(torch.equal(value, again[key]) for key, value in whole.items())
+    with pytest.raises(InputError, match=r"was made with other peak; remove it to train from the"):
+        train_stage("drawn", out, out, stage=replace(drawn, peak=1.0), pool=pool)
 
     monkeypatch.setitem(recipe.STAGES, "drawn", drawn)
     folder = export_editor("drawn", out, out / "exported")
@@ -120,104 +111,3 @@ def test_an_unknown_stage_or_device_is_refused_by_name(words, reason):
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 2
     assert reason in " ".join(result.output.replace("│", " ").split())
-
-
-# Encoders -------------------------------------------------------------------------------------------------------------
-
-
-def noise_pictures(*_, **__):
-    """Four worlds of noise in two views and two looks."""
-    rng = np.random.default_rng(4)
-    world, view, look = (v.ravel() for v in np.indices((4, 2, 2)))
-    zeros = np.zeros(len(world), np.int64)
-    columns = [world % len(OBJECTS), zeros, look, zeros - 1, look, zeros]
-    images = rng.integers(256, size=(len(world), 40, 40, 3), dtype=np.uint8)
-    return Pictures(images, np.stack(columns, axis=1), world, view, look)
-
-
-def dressed_pictures(*_):
-    """Five worlds of noise with parts in two halves."""
-    rng = np.random.default_rng(3)
-    world, view, look = (v.ravel() for v in np.indices((5, 2, part_pictures.LOOKS)))
-    surfaces = np.full((len(world), len(PARTS), 3), -2)
-    for p in (0, 5):
-        surfaces[:, p] = [0, 0, -1]
-        surfaces[:, p, 1] = rng.integers(len(COLORS), size=len(world))
-    ids = np.full((10, 32, 32), GROUND, np.uint8)
-    ids[:, :, :16], ids[:, :8, 16:], ids[:, 8:16, 16:] = 0, 5, SKY
-    return PartPictures(
-        rng.integers(256, size=(len(world), 32, 32, 3), dtype=np.uint8), surfaces, world % len(KINDS), world % len(GROUNDS),
-        world % 4, world, view, look, world * 2 + view, ids, part_pictures.shares_of(ids),
-    )  # fmt: skip
-
-
-@pytest.fixture
-def small(monkeypatch, tmp_path):
-    """The recipes of encoders on a few pictures of noise."""
-    for module in (naming, dino, perceptual):
-        monkeypatch.setattr(module, "load", noise_pictures)
-    for module in (naming, clip, dino, perceptual):
-        monkeypatch.setattr(module, "BATCH", 4)
-    monkeypatch.setattr(naming, "KEPT", 1)
-    monkeypatch.setattr(naming.warm_start, "__kwdefaults__", {"epochs": 1})
-    monkeypatch.setattr(clip.train, "__kwdefaults__", {"epochs": 1})
-    monkeypatch.setattr(clip.make_tokenizer, "__defaults__", (300,))
-    monkeypatch.setattr(perceptual, "STEPS", 1)
-    monkeypatch.setattr(part_pictures, "load", dressed_pictures)
-    monkeypatch.setattr(clip_parts, "load_pictures", noise_pictures)
-    sizes = {"STEPS": 1, "UNITS": 1, "SINGLE": 4, "CROP": 32, "KEPT": 1, "NOUNS_EACH": 1}
-    for name, value in sizes.items():
-        monkeypatch.setattr(clip_parts, name, value)
-    return tmp_path
-
-
-def exported(folder, name, net, part="model", prefix=""):
-    """The loaded encoder of a checkpoint's exported file; its weights are the checkpoint's in half precision."""
-    export(name, folder, folder / "weights")
-    load = dino_small.load if name == "dino-small" else bundled.load
-    encoder = load(name, folder / "weights")
-    stored = torch.load(folder / f"{name}.pt", weights_only=True)[part]
-    assert type(encoder.net) is net
-    for key, value in encoder.net.state_dict().items():
-        assert torch.equal(value, stored[prefix + key].half().to(value.dtype)), key
-        assert torch.isfinite(value.float()).all()
-    return encoder
-
-
-def test_clip_small_and_clip_parts_are_trained_and_loaded(small):
-    clip_parts.train(small, small, epochs=1)  # after clip-small, which starts from names
-    picture = np.random.default_rng(0).uniform(size=(40, 40, 3)).astype(np.float32)
-    for name, net in (("clip-small", ClipSmall), ("clip-parts", ClipParts)):
-        encoder = exported(small, name, net)
-        assert np.isfinite(encoder.images([picture])).all()
-        assert np.isfinite(encoder.texts(["a red ball"])).all()
-
-
-def test_dino_small_is_trained_and_loaded(small):
-    dino.train(small, small, epochs=1)
-    encoder = exported(small, "dino-small", dino_small.DinoSmall, "teacher", "net.")
-    assert encoder.tokens([np.zeros((40, 40, 3), np.float32)]).shape == (1, 8, 8, 192)
-
-
-def test_perceptual_small_is_trained_and_loaded(small):
-    perceptual.train(small, small, epochs=1)
-    encoder = exported(small, "perceptual-small", PerceptualSmall)
-    picture = np.random.default_rng(0).uniform(size=(40, 40, 3)).astype(np.float32)
-    assert encoder.distance([picture, picture], [picture, 1 - picture])[0] == 0
-
-
-def test_a_stopped_training_gives_the_same_bits_and_another_recipe_is_refused(small, monkeypatch):
-    for name in ("whole", "halves"):
-        (small / name).mkdir()
-    perceptual.train(small, small / "whole", epochs=2)
-    with stopped_at(perceptual, "rate", 1):
-        perceptual.train(small, small / "halves", epochs=2)
-    perceptual.train(small, small / "halves", epochs=2)
-    one, other = (
-        torch.load(small / name / "perceptual-small.pt", weights_only=True)["model"]
-        for name in ("whole", "halves")
-    )
-    assert all(torch.equal(value, other[key]) for key, value in one.items())
-    monkeypatch.setattr(perceptual, "PEAK", 1.0)
-    with pytest.raises(InputError, match=r"was made with other PEAK; remove it to train from the"):
-        perceptual.train(small, small / "halves", epochs=2)

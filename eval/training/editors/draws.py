@@ -14,8 +14,8 @@ from torch import Tensor
 
 from attnwarp.editing.latents import CHANNELS
 from training.editors.answers import codes
+from training.editors.byte_pairs import tokens_of
 from training.editors.net import TOKENS, EditorNet
-from training.encoders.byte_pairs import tokens_of
 from training.worlds.editing_pairs import (
     AMBIGUOUS,
     GROUPS,

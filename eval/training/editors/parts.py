@@ -31,6 +31,7 @@ from attnwarp_eval.drawn.worlds import COLORS, HSV, shade
 from attnwarp_eval.scene.base import linear_rgb
 from training.common import descend
 from training.editors.answers import codes
+from training.editors.byte_pairs import tokens_of
 from training.editors.draws import ALIGNED, DRAW_GAIN
 from training.editors.export import write_editor
 from training.editors.net import (
@@ -43,7 +44,6 @@ from training.editors.net import (
 )
 from training.editors.pool import MOST_THING_WEIGHT, THING_WEIGHT
 from training.editors.recipe import DROP, weights_of
-from training.encoders.byte_pairs import tokens_of
 from training.steps import STEPS_AN_EPOCH, Task, train_steps
 from training.worlds import recolors
 

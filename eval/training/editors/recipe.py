@@ -23,6 +23,7 @@ from training import steps
 from training.editors import draws as editor_draws
 from training.editors import net as editor_net
 from training.editors import pool as editor_pool
+from training.editors.byte_pairs import learn_byte_pairs, tokens_of
 from training.editors.net import (
     SHIFT,
     TOKENS,
@@ -34,7 +35,6 @@ from training.editors.net import (
     scheduler,
 )
 from training.editors.pool import Batch, PairPool
-from training.encoders.byte_pairs import learn_byte_pairs, tokens_of
 from training.steps import Task, train_steps
 from training.worlds.editing_pairs import (
     AMBIGUOUS,
@@ -121,7 +121,7 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
         corpus.append(instruction(kind, thing, row, rng))
         if kind in AMBIGUOUS:
             corpus.append(ambiguous_instruction(kind, thing, rng))
-    return learn_byte_pairs(corpus, vocabulary=VOCABULARY, most_tokens=TOKENS, length=TOKENS)
+    return learn_byte_pairs(corpus, vocabulary=VOCABULARY, length=TOKENS)
 
 
 def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

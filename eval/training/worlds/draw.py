@@ -6,7 +6,7 @@ One :class:`World` has many looks, which gives pictures that differ in only one 
 from __future__ import annotations
 
 import colorsys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,6 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 
 COLORED = ("plain", "shiny", "striped", "checked")
-
-ATTRIBUTES = ("object", "finish", "color", "second", "ground", "time")
-"""Attributes of a picture, indices into their words; -1 if absent or not mentioned."""
 
 TRAIN_SHAPES = 40
 """Training instances of each object; held-out ones count from :data:`HELD_OUT_SHAPE`."""
@@ -214,27 +211,3 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
             finish, color if kind in COLORED else -1, second if kind in TWO_COLORED else -1,
             int(rng.integers(len(GROUNDS))), int(rng.choice(len(TIMES), p=[0.4, 0.2, 0.2, 0.2])), int(rng.integers(2**31)),
         )  # fmt: skip
-
-
-def change(
-    look: Look, what: str, thing: int, rng: np.random.Generator, *, pairs: str = "seen"
-) -> Look:
-    """The look with one attribute changed: "surface" (finish and colours), "ground" or "time"; all else the same."""
-    while True:
-        other = draw_look(thing, rng, pairs=pairs)
-        match what:
-            case "surface":
-                new = replace(look, finish=other.finish, color=other.color, second=other.second)
-            case "ground":
-                new = replace(look, ground=other.ground)
-            case "time":
-                new = replace(look, time=other.time)
-            case _:
-                raise ValueError(f"what: got {what!r}, expected surface, ground or time")
-        if attributes(thing, new) != attributes(thing, look):
-            return new
-
-
-def attributes(thing: int, look: Look) -> tuple[int, ...]:
-    """Attributes of a picture, in the order of :data:`ATTRIBUTES`."""
-    return (thing, look.finish, look.color, look.second, look.ground, look.time)

@@ -64,7 +64,7 @@ THING, GROUND, OTHER, SKY = 0, 1, 2, 255
 
 @dataclass(frozen=True)
 class PairSplit:
-    """A set of worlds; seeds of splits do not meet with each other's, nor with those of :mod:`training.worlds.data`."""
+    """A set of worlds; seeds of splits do not meet with each other's, nor with those of other recipes."""
 
     first: int
     worlds: int

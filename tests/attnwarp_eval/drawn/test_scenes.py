@@ -20,8 +20,8 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import likely_bounces
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.bounces import search
-from training.worlds.data import SPLITS
 from training.worlds.editing_pairs import PAIR_SPLITS
+from training.worlds.recolors import RECOLOR_SPLITS
 
 EDITS = ["colour", "material", "part", "ground", "light", "several", "some_colour", "parts"]
 
@@ -75,7 +75,7 @@ def test_two_seeds_share_no_scene_and_no_shape():
 
 
 def test_no_thing_has_a_shape_of_training_or_a_colour_that_training_shows_it_in():
-    shown = [split.first for split in (*SPLITS.values(), *PAIR_SPLITS.values())]
+    shown = [split.first for split in (*PAIR_SPLITS.values(), *RECOLOR_SPLITS.values())]
     assert max(shown) + 10_000_000 < FIRST_SHAPE
     for k in range(25):
         for thing in draw(k, seed=7).things:

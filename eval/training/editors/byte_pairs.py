@@ -1,4 +1,4 @@
-"""Tokenizers that the recipes learn from their own sentences."""
+"""Tokenizer that a recipe learns from its own sentences."""
 
 from __future__ import annotations
 
@@ -16,15 +16,12 @@ from tokenizers import (
 )
 
 
-def learn_byte_pairs(
-    corpus: Iterable[str], *, vocabulary: int, most_tokens: int, length: int | None = None
-) -> Tokenizer:
+def learn_byte_pairs(corpus: Iterable[str], *, vocabulary: int, length: int) -> Tokenizer:
     """Byte-level byte pairs: any text can be encoded, and a word of the corpus takes a token or two.
 
     Args:
         vocabulary: how many tokens there are; 0 pads and 1 ends a sentence.
-        most_tokens: largest number of tokens of a sentence; the rest is cut.
-        length: to which every sentence is padded; that of a batch's longest if left out.
+        length: number of tokens to which every sentence is padded or cut.
     """
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
@@ -41,7 +38,7 @@ def learn_byte_pairs(
         single="$A <end>", special_tokens=[("<end>", 1)]
     )
     tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=length)
-    tokenizer.enable_truncation(most_tokens)
+    tokenizer.enable_truncation(length)
     return tokenizer
 
 
