@@ -55,11 +55,10 @@ measured: kernels
 	@rm -rf $(GATE)
 	ATTNWARP_CACHE=$(GATE)/derived ATTNWARP_MITSUBA=scalar_rgb $(BIN)/attnwarp-eval run gate --out $(GATE)
 
-## every benchmark but that of a GPU, one after the other; the study `quick` and 3D scenes of 200,000 splats among them
+## the benchmarks that need nothing but this machine, one after the other
+BENCHMARKS := before editing injection render warp
 bench: venv
-	@for file in $$(grep -l '__main__' benchmarks/*.py | grep -v benchmarks/gpu.py); do \
-		$(BIN)/python -m "benchmarks.$$(basename "$$file" .py)" || exit; \
-	done
+	@for name in $(BENCHMARKS); do $(BIN)/python -m "benchmarks.$$name" || exit; done
 
 ## the documents and the reference of both packages as a site: build/site/index.html
 docs: venv

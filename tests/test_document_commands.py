@@ -180,8 +180,8 @@ def test_every_command_of_a_page_can_be_called_as_it_stands_there(page):
         "attnwarp fit DATA --kinds 2dgs --out fits/bear",
         "attnwarp-eval scene list",
         "attnwarp-eval run quik",
-        "python -m benchmarks.scales --cells 1000",
-        "python -m benchmarks.scale --cell 1000 --clusters 3",
+        "python -m benchmarks.renders --quick",
+        "python -m benchmarks.render --quicker",
         "cd evals",
         "make tests",
         "pip install '.[edit,evaluation]'",
@@ -194,6 +194,14 @@ def test_a_command_that_cannot_be_called_is_found(line, tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text(f"```sh\n{line}    # as documents have it\n```\n")
     assert len(list(problems(page))) == 1
+
+
+def test_every_benchmark_of_make_bench_needs_no_argument():
+    (names,) = re.findall(r"^BENCHMARKS := (.+)$", (ROOT / "Makefile").read_text(), re.M)
+    for name in names.split():
+        check_python(["-m", f"benchmarks.{name}"], ROOT)
+    with pytest.raises(SystemExit):  # it needs a folder
+        check_python(["-m", "benchmarks.drift"], ROOT)
 
 
 CHEAP = {
