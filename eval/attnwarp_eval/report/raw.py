@@ -32,6 +32,12 @@ NAME = "results.jsonl.xz"
 PARTS = "results*.jsonl.xz"
 """Files of raw results in a folder; several are parts of one study."""
 
+GONE = {
+    "growing": "attention_warping", "seeded": "attention_warping",
+    "growing true pictures": "true pictures", "seeded true pictures": "true pictures",
+}  # fmt: skip
+"""Methods of committed results that no study has any more, and those that they varied."""
+
 DIGITS = 6
 """Significant digits of a figure: the rounding is below every tolerance of a metric."""
 
@@ -114,6 +120,8 @@ def _study(data: Any) -> Study:
         if variant.get("control") == "another seed":
             # No key says it any more. A drift by 0 keeps it apart from the variant it repeats.
             variant |= {"control": None, "drift": {}}
+        if variant.get("method") in GONE:
+            variant |= {"method": GONE[variant["method"]], "drift": {}}
         # Committed results have arms of several sources, which no edit has any more.
         variant.get("options", {}).pop("sources", None)
     try:

@@ -220,10 +220,10 @@ def _edited(result: Any) -> EditedScene:
     )  # fmt: skip
 
 
-def true_pictures(job: Job, base: type[AttentionWarping] | None = None) -> EditedScene:
+def true_pictures(job: Job) -> EditedScene:
     """Take the first answer's true pictures in every view, and tune splats on them: the ceiling.
 
-    Stages, their views and their tuning are those of ``base``, by default ``attention_warping``.
+    Stages, their views and their tuning are those of ``attention_warping``.
 
     Raises:
         ValueError: a budget or a donor, neither of which means anything here.
@@ -236,7 +236,7 @@ def true_pictures(job: Job, base: type[AttentionWarping] | None = None) -> Edite
             raise ValueError(f"{name}: got one, but 'true pictures' edits nothing; leave it out")
     pictures = next(iter(job.truth.values()))
 
-    class TruePictures(base or AttentionWarping):  # type: ignore[misc]
+    class TruePictures(AttentionWarping):
         """Views become their true pictures."""
 
         def edit_source(self, *_: Any) -> list[ViewEdit]:

@@ -15,7 +15,6 @@ import numpy.typing as npt
 import torch
 from pydantic import Field
 
-import attnwarp_lab.probes.shape.tunings  # noqa: F401  (registers its methods)
 from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods import AttentionWarpingSettings, attention_warping
