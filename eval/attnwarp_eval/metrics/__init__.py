@@ -46,6 +46,7 @@ from attnwarp_eval.metrics.multiview import (
     above_floor,
     answers_by_view,
     edit_fidelity,
+    same_parts,
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
@@ -93,6 +94,7 @@ __all__ = [
     "perceptual_consistency",
     "psnr",
     "reconstruct",
+    "same_parts",
     "scores",
     "ssim",
     "ssim_map",

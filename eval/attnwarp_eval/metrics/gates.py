@@ -74,6 +74,7 @@ GATES: Mapping[str, Margin] = {
     "multiview.delta_e": Margin(0.05, 0.02),
     "multiview.delta_e_above": Margin(0.05, 0.02),
     "multiview.same_answer": Margin(5e-3),
+    "multiview.same_part": Margin(0.1),
     "embedding.clip_similarity": Margin(5e-3),
     "embedding.clip_directional": Margin(5e-3),
     "embedding.clip_image": Margin(5e-3),

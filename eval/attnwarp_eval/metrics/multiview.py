@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from attnwarp_eval.colors import color_difference, to_linear, to_srgb
 from attnwarp_eval.metrics._pictures import picture, region
 from attnwarp_eval.metrics.arrays import mean, share
 from attnwarp_eval.metrics.consistency import cross_view
@@ -16,6 +17,12 @@ from attnwarp_eval.metrics.image import Distance, mse
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
+
+LEAST_PART = 16
+"""Pixels of a part in a view, below which its mean colour is not compared."""
+
+ANOTHER_COLOR = 10.0
+"""CIEDE2000 from which two mean colours are two answers."""
 
 
 def above_floor(
@@ -103,6 +110,49 @@ def answers_by_view(
         defined = {name: error for name, error in errors.items() if not math.isnan(error)}
         result[view] = min(defined, key=defined.__getitem__) if defined else None
     return result
+
+
+def same_parts(
+    before: tuple[Any, Any], after: tuple[Any, Any], parts: Iterable[tuple[Any, Any]]
+) -> float:
+    """Share of a thing's parts that have the source's colour in another view.
+
+    The source's mean colour of a part is expected there as bright as the part was before the edit.
+    A part that the source's edit left as it was shows no answer, and is left out.
+
+    Args:
+        before, after: (H, W, 3) sRGB in [0, 1] of source and view.
+        parts: by part, (H, W) bool in the source and in the view, where its colours are averaged.
+
+    Returns:
+        The share; NaN if there is no part of :data:`LEAST_PART` pixels in both views.
+
+    Example:
+        >>> import numpy as np
+        >>> grey = np.full((8, 8, 3), 0.5)
+        >>> blue, red = grey * [0, 0, 1], grey * [1, 0, 0]
+        >>> left = np.arange(64).reshape(8, 8) % 8 < 4
+        >>> view = np.where(left[..., None], blue, red)
+        >>> same_parts((grey, grey), (blue, view), [(left, left), (~left, ~left)])
+        0.5
+    """
+
+    def mean(image: Any, inside: Any) -> Any:
+        return to_linear(np.asarray(image, np.float64)[inside]).mean(axis=0)
+
+    def apart(a: Any, b: Any) -> bool:
+        one, two, all_of = to_srgb(a)[None, None], to_srgb(b)[None, None], np.ones((1, 1), bool)
+        return color_difference(one, two, all_of) >= ANOTHER_COLOR
+
+    found = []
+    for own, there in parts:
+        if min(own.sum(), there.sum()) < LEAST_PART:
+            continue
+        source, painted, view = mean(before[0], own), mean(after[0], own), mean(before[1], there)
+        if apart(source, painted):
+            light = view.sum() / max(source.sum(), 1e-6)
+            found.append(not apart(painted * light, mean(after[1], there)))
+    return share(sum(found), len(found))
 
 
 def edit_fidelity(

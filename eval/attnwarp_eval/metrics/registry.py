@@ -186,6 +186,7 @@ _SPECS = (
     Metric("multiview.share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
     Metric("multiview.pixels", "pixels", "none", 0, 0, "pixels compared"),
     Metric("multiview.same_answer", "share", "higher", 1e-4, 0, "views whose nearest answer is the source's"),
+    Metric("multiview.same_part", "share", "higher", 1e-4, 0, "parts with the source's colour, as bright as they were"),
     Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit", squared=True),
     Metric("fidelity.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the truth of the edit"),
     Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),

@@ -14,8 +14,8 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     """A study's data with the files of its population under ``scenes``; none is drawn yet.
 
     Data expanded before names files, perhaps in another machine's cache: they become this one's. An
-    entry of ``editing.edits`` for the population's name, such as ``drawn``, becomes one entry for
-    each of its scenes.
+    entry of ``editing.edits`` or ``carry.edits`` for the population's name, such as ``drawn``,
+    becomes one entry for each of its scenes.
 
     Args:
         data: data of a study; ``scenes`` is a mapping, or ``population`` names their population.
@@ -54,14 +54,13 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
         result["scenes"] = [str(files[path.stem]) for path in named]
     else:
         return result
-    editing = result.get("editing")
-    if not isinstance(editing, Mapping):
-        return result
-    edits = editing.get("edits")
-    if isinstance(edits, Mapping) and wanted.word in edits:
-        own = {name: value for name, value in edits.items() if name != wanted.word}
-        each = {Path(name).stem: edits[wanted.word] for name in result["scenes"]}
-        result["editing"] = {**editing, "edits": {**each, **own}}
+    for key in ("editing", "carry"):
+        part = result.get(key)
+        edits = part.get("edits") if isinstance(part, Mapping) else None
+        if isinstance(edits, Mapping) and wanted.word in edits:
+            own = {name: value for name, value in edits.items() if name != wanted.word}
+            each = {Path(name).stem: edits[wanted.word] for name in result["scenes"]}
+            result[key] = {**result[key], "edits": {**each, **own}}
     return result
 
 

@@ -7,6 +7,9 @@ import pytest
 import yaml
 from skimage.color import deltaE_ciede2000, rgb2lab
 
+from attnwarp_eval import metrics
+from attnwarp_eval.colors import to_linear, to_srgb
+from attnwarp_eval.metrics import multiview
 from attnwarp_eval.report.build import build
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
@@ -87,6 +90,24 @@ def test_views_differ_from_the_source_by_their_colours_at_the_points_that_both_s
     (grid,) = next(s for s in page.sections if s.title == "Edited views side by side").grids
     assert [label for label, _ in grid.rows] == ["before", "painted"]
     assert grid.columns[0] == "source" and len(grid.columns) == len(names)
+
+
+def test_a_part_has_the_sources_colour_in_any_light_and_not_another(folder, tmp_path, monkeypatch):
+    """Oracles: a ball painted alike, or not, in source and views, and pictures whose linear light is halved."""
+    for colors, shares in (((PINK, PINK), {1.0}), ((RED, PINK), {0.0}), ((None, PINK), set())):
+        painting(monkeypatch, colors[0])
+        (cell,) = cells(load(folder))
+        views = compute(probe("carry"), cell, tmp_path).views
+        for end in ("seen", "unseen"):
+            found = [view.metrics[f"multiview.same_part.{end}"] for view in views]
+            assert {value for value in found if not math.isnan(value)} == shares
+    every, grey = np.ones((8, 8), bool), np.full((8, 8, 3), 0.5)
+    dark, dim_pink = (to_srgb(to_linear(np.broadcast_to(c, (8, 8, 3))) / 2) for c in (0.5, PINK))
+    pictures = (grey, dark), (grey * 0 + PINK, dim_pink)
+    assert metrics.same_parts(*pictures, [(every, every)]) == 1.0
+    assert metrics.same_parts((grey, grey), pictures[1], [(every, every)]) == 0.0
+    few = np.arange(64).reshape(8, 8) < multiview.LEAST_PART - 1
+    assert math.isnan(metrics.same_parts(*pictures, [(every, few)]))
 
 
 def test_a_source_that_did_not_change_has_no_edit_to_carry(folder, tmp_path, monkeypatch):

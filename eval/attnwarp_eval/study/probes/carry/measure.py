@@ -70,7 +70,9 @@ class CarryProbe(MethodProbe[NoExtra]):
     name = "carry"
     protocol = 2
     study_part = StudyPart
-    metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
+    metrics = Registry(
+        {name: METRICS[name] for name in ("multiview.delta_e", "multiview.same_part")}
+    )
 
     def check(self, study: Study) -> None:
         """Require an edit, editing variants, and an editor that takes instructions."""
@@ -164,6 +166,13 @@ class CarryProbe(MethodProbe[NoExtra]):
                 judged = done and difference.counted.sum() >= LEAST_PIXELS
                 value = difference.delta_e[difference.counted].mean() if judged else math.nan
                 row = {"multiview.delta_e": float(value)}
+                both = [(shot[source], shot[name]) for shot in (before, after)]
+                for end, region in (("seen", pair.visible), ("unseen", pair.unseen)):
+                    parts = [
+                        (hits[source].object_id == k, (hits[name].object_id == k) & region)
+                        for k in objects
+                    ]
+                    row[f"multiview.same_part.{end}"] = metrics.same_parts(both[0], both[1], parts)
                 work.add(name, row, partial(_jpegs, shown, name))
         return NoExtra()
 

@@ -18,6 +18,9 @@ from attnwarp_eval.study.probe_report import (
 from attnwarp_eval.study.probes.carry.measure import LEAST_CHANGE
 from attnwarp_eval.study.results import Results
 
+MOST_ROWS = 24
+"""Rows of the table of single scenes that stand on the page."""
+
 
 @register_report
 class CarryReport(ProbeReport):
@@ -26,7 +29,11 @@ class CarryReport(ProbeReport):
     name = "carry"
     measures = "an edit carried to a few views"
     tabulates_all = True
-    columns: ClassVar[Mapping[str, str]] = {"colour difference, dE00": "multiview.delta_e"}
+    columns: ClassVar[Mapping[str, str]] = {
+        "parts with the source's colour": "multiview.same_part.seen",
+        "... where the source does not see them": "multiview.same_part.unseen",
+        "colour difference, dE00": "multiview.delta_e",
+    }
     cost = "whole"
     cost_of = "an edit"
     cost_text = "Seconds are those of the source's edit, the warps and the views' edits."
@@ -49,7 +56,8 @@ class CarryReport(ProbeReport):
                 " the thing by exact depth. A dash: the two share no 16 pixels of it, or the source"
                 f" changed by less than {LEAST_CHANGE:g} dE00, so that there is no edit to carry."
             )
-            yield Section("An edit carried", [text], [Table(columns, table)])
+            folded = len(rows) > MOST_ROWS
+            yield Section("An edit carried", [text], [Table(columns, table, folded=folded)])
 
     def gallery(self, results: Results) -> Section | None:
         """Pictures of each scene."""
