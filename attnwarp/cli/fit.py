@@ -263,7 +263,7 @@ def _fit(
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = None
     if test is not None:
-        held_out = attnwarp.fit.load_views(test, max_size=max_size, damaged="error")
+        held_out = attnwarp.fit.load_views(test, max_size=max_size)
     if first is not None and start is not None:
         check_seen(start, first, train.cameras, report)
         warn_of_misfit(start, first, train)

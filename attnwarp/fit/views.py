@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -298,7 +298,6 @@ def load_views(
     dataset: Dataset,
     *,
     max_size: int | None = None,
-    damaged: Literal["warn", "error"] = "warn",
     exposures: Mapping[str, npt.NDArray[np.floating[Any]]] = MappingProxyType({}),
 ) -> Views:
     """Read the pictures of a dataset; cameras without a picture are left out. Pictures beyond
@@ -308,8 +307,6 @@ def load_views(
         dataset: dataset, see :func:`attnwarp.io.read_dataset`.
         max_size: longest side in px; larger pictures and their cameras are averaged down to
             it.
-        damaged: "error" refuses damaged pictures, for measurements; see
-            :func:`attnwarp.io.read_image`.
         exposures: (3, 4) change of colour of views by their cameras' names, see
             :func:`attnwarp.fit.read_exposures`.
 
@@ -330,7 +327,6 @@ def load_views(
         32
     """
     cameras, readers, masks = [], [], []
-    seen: set[Path] = set()
     for camera, path, lens, mask in zip(
         dataset.cameras, dataset.image_paths, dataset.lenses, dataset.mask_paths, strict=True
     ):
@@ -346,7 +342,7 @@ def load_views(
             width, height = (max(1, round(factor * v)) for v in (camera.width, camera.height))
             shown = camera.resize(width, height)
         cameras.append(shown)
-        readers.append(partial(_read, path, camera, shown, damaged, seen))
+        readers.append(partial(_read, path, camera, shown))
         masks.append(None if mask is None else read_mask(mask, shown.height, shown.width))
     if not cameras:
         raise ValueError(
@@ -357,18 +353,11 @@ def load_views(
     return Views(cameras, Drawn(readers, READ_BYTES), masks, changes)
 
 
-def _read(
-    path: Path, camera: Camera, shown: Camera, damaged: Literal["warn", "error"], seen: set[Path]
-) -> npt.NDArray[Any]:
-    """Read a picture of a camera's size, averaged down to that of ``shown``; warn when it is first
-    seen."""
+def _read(path: Path, camera: Camera, shown: Camera) -> npt.NDArray[Any]:
+    """Read a picture of a camera's size, averaged down to that of ``shown``."""
     import cv2
 
-    with warnings.catch_warnings():
-        if path in seen:
-            warnings.simplefilter("ignore", InputWarning)
-        image = read_image(path, damaged=damaged)
-    seen.add(path)
+    image = read_image(path)
     if image.shape[:2] != (camera.height, camera.width):
         raise FileFormatError(
             path,

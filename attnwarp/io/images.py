@@ -1,26 +1,21 @@
-"""Reading of pictures, the only entry point, so that damaged files are refused everywhere.
+"""Reading of pictures, the only entry point, so that truncated files are refused everywhere.
 
-OpenCV reads the pixels, since it keeps 16 bits. It fills missing parts of a JPEG with grey and
-returns a picture; Pillow, which refuses such a file, therefore decodes the file first.
+Pillow reads the pixels of 8 bits, and OpenCV those of 16, which Pillow cuts to 8.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import re
-import tempfile
-import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
-from attnwarp.errors import InputWarning
 from attnwarp.io.file import FileFormatError, existing_file
 
 IMAGE_SUFFIXES = (
@@ -36,8 +31,6 @@ IMAGE_SUFFIXES = (
     ".exr",
 )
 """Suffixes of images, in search order."""
-
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -61,7 +54,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         >>> image_size("image.png")
         (3, 2)
     """
-    path = _readable(path)
+    path = existing_file(path)
     size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size)
     if size is None:
         height, width = read_image(path).shape[:2]
@@ -101,10 +94,7 @@ def upright_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 def read_upright(
-    path: str | os.PathLike[str],
-    *,
-    beside: str | os.PathLike[str] | None = None,
-    damaged: Literal["warn", "error"] = "warn",
+    path: str | os.PathLike[str], *, beside: str | os.PathLike[str] | None = None
 ) -> npt.NDArray[Any]:
     """Read a picture as viewers show it: rotated or mirrored by its EXIF tag.
 
@@ -112,7 +102,6 @@ def read_upright(
         path: path of the picture, see :func:`read_image`.
         beside: path of the posed picture that this one belongs to. A posed picture's pixels are
             used as stored, so a tag present in both is ignored in both.
-        damaged: treatment of damaged files, see :func:`read_image`.
 
     Returns:
         (H, W, 3) or (H, W, 4) as in :func:`read_image`.
@@ -127,7 +116,7 @@ def read_upright(
         >>> read_image("turned.jpg").shape, read_upright("turned.jpg").shape
         ((3, 4, 3), (4, 3, 3))
     """
-    stored = read_image(path, damaged=damaged)
+    stored = read_image(path)
     turn = orientation(path)
     if turn == 1 or (beside is not None and orientation(beside) == turn):
         return stored
@@ -136,29 +125,23 @@ def read_upright(
     return np.ascontiguousarray(np.flip(stored, _FLIPS.get(turn, ())))
 
 
-def read_image(
-    path: str | os.PathLike[str], *, damaged: Literal["warn", "error"] = "warn"
-) -> npt.NDArray[Any]:
+def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     """Read a picture, (H, W, 3) or (H, W, 4) sRGB, in the file's depth and stored orientation.
 
     Grey becomes three equal channels. A camera's pose refers to the stored pixels, so an EXIF
     rotation is not applied; :func:`read_upright` applies it.
 
     Args:
-        path: picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP.
-        damaged: "error" refuses a JPEG that triggers decoder warnings, for measurements. A JPEG has
-            no checksum, so some damage is visible only in the picture.
+        path: picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP. A JPEG has no checksum, so
+            that damage inside it is visible in the picture alone.
 
     Returns:
         uint8 or uint16; a fourth channel is straight (not premultiplied) alpha.
 
-    Warns:
-        InputWarning: the decoder's warnings on a JPEG, with ``damaged="warn"``.
-
     Raises:
         FileNotFoundError: the file does not exist.
-        FileFormatError: the file is not a picture, is truncated or damaged, has neither 8 nor 16
-            bits, or exceeds Pillow's size limit (about 179 million px).
+        FileFormatError: the file is not a picture, is truncated, has neither 8 nor 16 bits, asks to
+            be turned and is a TIFF, or exceeds Pillow's size limit (about 179 million px).
 
     Example:
         >>> from attnwarp.io import read_image
@@ -169,24 +152,13 @@ def read_image(
     """
     import cv2
 
-    path = _readable(path)
-    rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv)
-    data = path.read_bytes()
-    # Some decoders skip PNG checksums, and damage would become pixels.
-    if data.startswith(_PNG) and not _with_pillow(path, lambda image: image.verify() or True):
-        raise FileFormatError(path, "the picture is damaged; replace it or leave it out")
-    if rgba is not None:
-        return rgba
+    path = existing_file(path)
+    pixels: npt.NDArray[Any] | None = _with_pillow(path, _pixels)
+    if pixels is not None:
+        return pixels
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     # Never by path: OpenCV crashes on a name that is not UTF-8.
-    bits = np.frombuffer(data, np.uint8)
-
-    def decode() -> Any:
-        return cv2.imdecode(bits, flags) if data else None
-
-    image, complaint = _with_complaint(decode) if data.startswith(_JPEG) else (decode(), "")
-    if complaint:
-        _report(path, complaint, damaged)
+    image = cv2.imdecode(np.fromfile(path, np.uint8), flags)
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
@@ -249,6 +221,16 @@ def weighted_by_alpha(
     return np.round(np.clip(values, 0, 1) * top).astype(image.dtype)
 
 
+def _pixels(image: Any) -> npt.NDArray[np.uint8] | None:
+    """Decode a picture of 8 bits, (H, W, 3) or (H, W, 4); of a deeper one, which Pillow would cut
+    to 8 bits, only see that it is whole.
+    """
+    deep = image.mode in ("I", "F") or ";16" in str(image.tile)
+    image.load()
+    clear = image.mode.endswith("A") or "transparency" in image.info
+    return None if deep else np.array(image.convert("RGBA" if clear else "RGB"))
+
+
 def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
     """Open a picture with Pillow and return ``use`` of it; an error message has one line.
 
@@ -261,6 +243,11 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
             # Pillow's warnings of a large picture or an odd tag are ignored.
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
+                tags = getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
+                if tags.get(_ORIENTATION, 1) != 1:  # Pillow would turn the pixels of this format
+                    raise FileFormatError(
+                        path, "asks to be turned by a tag; convert it to an upright PNG"
+                    )
                 return use(image)
     except UnidentifiedImageError:
         return None
@@ -271,7 +258,7 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
         ) from None
     # A damaged byte can raise any exception in Pillow's decoders.
     except (OSError, SyntaxError, ValueError, ArithmeticError, LookupError, TypeError) as error:
-        if isinstance(error, OSError) and error.errno is not None:
+        if isinstance(error, FileFormatError) or getattr(error, "errno", None) is not None:
             raise
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise FileFormatError(
@@ -279,97 +266,8 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
         ) from None
 
 
-_COMPLAINT = re.compile(rb"^(?:Corrupt JPEG|Premature end|Inconsistent prog|Invalid ).*\n", re.M)
-"""Warnings of libjpeg (jerror.h) after which pixels are invented."""
-
-_STDERR = threading.Lock()
-
-
-def _with_complaint(decode: Callable[[], Any]) -> tuple[Any, str]:
-    """Return the result of ``decode`` and libjpeg's messages on standard error, the only way OpenCV
-    passes warnings on. Other output in the meantime is forwarded afterwards.
-    """
-    with _STDERR, tempfile.TemporaryFile() as caught:
-        try:
-            stderr = os.dup(2)
-        except OSError:  # stderr is closed
-            return decode(), ""
-        os.dup2(caught.fileno(), 2)
-        try:
-            result = decode()
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-            caught.seek(0)
-            written = caught.read()
-            if other := _COMPLAINT.sub(b"", written):
-                os.write(2, other)
-    found = _COMPLAINT.search(written)
-    return result, found[0].decode(errors="replace").strip() if found else ""
-
-
-def _report(path: Path, complaint: str, damaged: Literal["warn", "error"]) -> None:
-    """Warn of a damaged JPEG, or refuse it."""
-    message = (
-        f"{path}: the picture is damaged (the decoder says: {complaint}), so parts of it may be"
-        " wrong; get it again whole or leave it out, or, if it looks right, save it anew"
-    )
-    check.one_of(damaged, ("warn", "error"), "damaged")
-    if damaged == "error":
-        raise FileFormatError(path, message.removeprefix(f"{path}: "))
-    warnings.warn(message, InputWarning, stacklevel=3)
-
-
-def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | None:
-    """Decode a picture; return (H, W, 4) if OpenCV drops its alpha or multiplies it into the
-    colours: TIFF of 8 bits, and grey PNG with a transparent value.
-    """
-    image.load()
-    clear = image.info.get("transparency")
-    if image.mode in ("I", "I;16") and clear is not None:
-        values = np.array(image, np.uint16)
-        alpha = np.where(values == clear, 0, 65535).astype(np.uint16)
-        return np.stack([values, values, values, alpha], axis=2)
-    tiff = image.format == "TIFF" and image.mode in ("LA", "RGBA")
-    # Pillow opens 16 bits as 8; OpenCV reads them correctly.
-    tiff = tiff and max(image.tag_v2.get(_BITS, (8,))) <= 8
-    grey = image.mode in ("1", "L") and clear is not None
-    return np.array(image.convert("RGBA")) if tiff or grey else None
-
-
-_ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
-"""TIFF tags of the orientation, the bits of each channel, and the number of channels."""
+_ORIENTATION = 274
+"""Tag of the orientation, in EXIF and TIFF."""
 
 _FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 """Axes to flip by EXIF orientation, after transposing for orientations from 5 on."""
-
-
-def _readable(path: str | os.PathLike[str]) -> Path:
-    """Return the path of an existing file, but for a TIFF that OpenCV or Pillow reads otherwise
-    than it is stored: they turn the pixels of this format by its tag, and of 16-bit grey with alpha
-    OpenCV reads 8 bits without alpha.
-    """
-    from PIL.TiffImagePlugin import PREFIXES, ImageFileDirectory_v2
-
-    path = existing_file(path)
-    with path.open("rb") as stream:
-        head = stream.read(8)
-        if not head.startswith(tuple(PREFIXES)):
-            return path
-        if 43 in head[2:4]:
-            raise FileFormatError(path, "is a BigTIFF; convert it to PNG")
-        tags: dict[int, Any] = {}
-        # Decoders report damage; here it can raise any exception in Pillow.
-        with warnings.catch_warnings(), contextlib.suppress(Exception):
-            warnings.simplefilter("ignore")
-            directory = ImageFileDirectory_v2(head)
-            stream.seek(directory.next)
-            directory.load(stream)
-            tags = {t: directory[t] for t in (_ORIENTATION, _BITS, _SAMPLES) if t in directory}
-    if tags.get(_ORIENTATION) in range(2, 9):
-        raise FileFormatError(path, "asks to be turned by a tag; convert it to an upright PNG")
-    if tags.get(_SAMPLES) == 2 and tags.get(_BITS) == (16, 16):
-        raise FileFormatError(
-            path, "grey of 16 bits with alpha, which cannot be read as TIFF; convert it to PNG"
-        )
-    return path

@@ -331,7 +331,7 @@ def read_picture(
 
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; check the path")
-    image = read_upright(path, beside=beside, damaged="error")
+    image = read_upright(path, beside=beside)
     values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.shape[2] == 3:
         return values

@@ -69,7 +69,7 @@ def _read(
     data: Path, images: Path | None, scale: int, max_size: int | None, source: str | None
 ) -> Ready:
     dataset = read_dataset(data, images=images, scale=scale)
-    views = load_views(dataset, max_size=max_size, damaged="error")
+    views = load_views(dataset, max_size=max_size)
     index = view_of(dataset, source)
     content = digest([views.digest, [camera.name for camera in views.cameras], index])
     return Ready(dataset, views, index, content)

