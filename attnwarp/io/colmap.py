@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
@@ -107,8 +106,7 @@ def read_colmap(
     A folder ``masks`` beside the images has masks of the same names, or with ".png" appended.
 
     Warns:
-        InputWarning: another model next to ``sparse/0`` has more images; the header of a text file
-            states another number of entries than the file has.
+        InputWarning: another model next to ``sparse/0`` has more images.
 
     Raises:
         FileNotFoundError: the folder has no model.
@@ -443,7 +441,6 @@ def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
             raise _damaged(path, number, line, f"{count} parameters for {model}")
         _once(path, intrinsics, camera)
         intrinsics[camera] = lens
-    _warn_of_count(path, "cameras", len(intrinsics))
     return intrinsics
 
 
@@ -461,14 +458,13 @@ def _text_images(path: Path) -> list[_Pose]:
             ) from error
         # The next line has the keypoints and may be empty, or missing at the end.
         number, line = next(lines, (number, ""))
-        if _is_image(line):
+        if len(line.split()) == 10:  # an image again; a keypoint has three numbers
             raise _damaged(
                 path,
                 number,
                 line,
                 "the keypoints X Y POINT3D_ID of the image before, or an empty line for none",
             )
-    _warn_of_count(path, "images", len(poses))
     return poses
 
 
@@ -477,27 +473,6 @@ def _text_pose(line: str) -> _Pose:
     _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
     rotation, translation = (qw, qx, qy, qz), (tx, ty, tz)
     return _Pose(tuple(map(float, rotation)), tuple(map(float, translation)), int(camera), name)
-
-
-def _is_image(line: str) -> bool:
-    """Return True if the line after an image is the next image, not keypoints. Keypoints are never
-    read, so their line may have any content.
-    """
-    try:
-        name = _text_pose(line).name
-    except ValueError:
-        return False
-    # Keypoints may begin like an image, but continue with numbers in groups of three.
-    first, *others = name.split(maxsplit=2)
-    return len(others) < 2 or not (_is_number(first) and _is_number(name.rsplit(maxsplit=1)[-1]))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
@@ -513,22 +488,7 @@ def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
                 raise ValueError(colors[-1])
         except ValueError as error:
             raise _damaged(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from error
-    _warn_of_count(path, "points", len(points))
     return _points(path, points, colors)
-
-
-def _warn_of_count(path: Path, noun: str, count: int) -> None:
-    """Warn if the header of a text file states another number of entries than it has."""
-    with path.open(encoding="utf-8", errors="surrogateescape") as lines:
-        head = "".join(itertools.takewhile(lambda line: line.startswith("#"), lines))
-    stated = re.search(rf"Number of {noun}: *(\d+)", head)
-    if stated and int(stated[1]) != count:
-        warnings.warn(
-            f"{path}: its head counts {stated[1]} {noun}, and {count} are there; unless entries"
-            " were removed on purpose, a line end is missing or the file breaks off",
-            InputWarning,
-            stacklevel=4,
-        )
 
 
 def _points(

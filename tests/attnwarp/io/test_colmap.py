@@ -252,28 +252,15 @@ def test_a_damaged_line_is_named(tmp_path, name, line, parts):
 
 
 @pytest.mark.door
-@pytest.mark.parametrize("name", ["b.png", "12", "b c d.png", "1 2 d.png"])
-def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path, name):
+def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path):
     write_text(tmp_path)
-    first, second = "1 1 0 0 0 0 0 1 7 a.png", f"2 1 0 0 0 0 0 1 7 {name}"
+    first, second = "1 1 0 0 0 0 0 1 7 a.png", "2 1 0 0 0 0 0 1 7 b.png"
     (tmp_path / "images.txt").write_text(f"{first}\n{second}\n")
     with pytest.raises(FileFormatError, match="images.txt: line 2: got '2 1 0.*an empty line for"):
         read_colmap(tmp_path, missing_images="none")
 
 
-@pytest.mark.parametrize(
-    "keypoints",
-    [
-        "",
-        "1.5 2.5 -1 3 4e1 17",
-        " ".join(["1.5 2.5 -1"] * 4),
-        " ".join(["1 2 3"] * 4),
-        "0",
-        "None",
-        "1.5 2.5 3.5 4.5 5.5 6.5 7.5 8.5 9.5 10.5",
-        "  # no keypoints",
-    ],
-)
+@pytest.mark.parametrize("keypoints", ["", "1.5 2.5 -1 3 4e1 17", "None", "  # no keypoints"])
 def test_keypoints_of_any_form_are_skipped(tmp_path, keypoints):
     """Oracle: the readers of COLMAP's own scripts, which split the line and use none of it here."""
     write_text(tmp_path)
@@ -281,35 +268,6 @@ def test_keypoints_of_any_form_are_skipped(tmp_path, keypoints):
     (tmp_path / "images.txt").write_text(f"{first}\n{keypoints}\n{second}\n")
     cameras = read_colmap(tmp_path, missing_images="none").cameras
     assert [camera.name for camera in cameras] == ["1.png", "2.png"]
-
-
-@pytest.mark.parametrize("joined", ["", " "])
-@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
-def test_no_line_end_is_lost_in_silence(tmp_path, name, joined):
-    """Oracle: the model before a line end was lost; COLMAP's head counts what the file holds."""
-    points = [*POINTS, (9, (1.5, 2, 3), (4, 5, 6), 0)]
-    pictures(tmp_path / "images")
-    expected = everything(read_colmap(write_text(tmp_path, points=points)))
-    file = tmp_path / name
-    lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
-    noun = name.removesuffix("3D.txt").removesuffix(".txt")
-    count = {"cameras": len(CAMERAS), "images": len(poses()), "points": len(points)}[noun]
-    lines = ["# A list", f"# Number of {noun}: {count}, a mean of 1", *lines]
-    for i in range(1, len(lines)):
-        joint = [*lines[: i - 1], lines[i - 1] + joined + lines[i], *lines[i + 1 :]]
-        file.write_text("\n".join(joint) + "\n")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", InputWarning)
-            try:
-                result = everything(read_colmap(tmp_path))
-            except (FileFormatError, InputWarning) as error:
-                assert name in str(error) or name == "cameras.txt"
-                continue
-        assert result == expected, joint[i - 1]
-
-
-def everything(data):
-    return [camera.to_dict() for camera in data.cameras], data.points.tolist(), data.colors.tolist()
 
 
 def test_an_empty_text_file_of_points_holds_none(tmp_path):
