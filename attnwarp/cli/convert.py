@@ -114,13 +114,4 @@ def undistort(
         count = sum(lens is not None for lens in dataset.lenses)
         with reporter(title=out.name) as report:
             result = attnwarp.io.undistort(dataset, out, report=report)
-        sizes = {
-            f"{old.width} x {old.height} px became {new.width} x {new.height}"
-            for old, new in zip(dataset.with_pictures().cameras, result.cameras, strict=True)
-            if (old.width, old.height) != (new.width, new.height)
-        }
-        resized = "".join(f"; {size}" for size in sorted(sizes)[:3])
-        typer.echo(
-            f"{out}: {len(result)} pictures, {count} of them undistorted{resized}"
-            + (f"; {len(sizes) - 3} other sizes changed" if len(sizes) > 3 else "")
-        )
+        typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")

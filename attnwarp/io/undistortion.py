@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import is_file, write_atomically
 from attnwarp.io.images import encode_png, read_image, read_mask
 from attnwarp.io.lens import undistorted_camera, undistorted_image
 from attnwarp.io.names import numbered
-from attnwarp.io.transforms import read_transforms, write_transforms
+from attnwarp.io.transforms import write_transforms
 from attnwarp.reporting import SILENT, Reporter
 
 
@@ -43,8 +42,7 @@ def undistort(
 
     Raises:
         FileFormatError: a picture is unreadable.
-        InputError: a result would overwrite an input picture, or the transforms.json of a folder
-            with an input picture.
+        InputError: a result would overwrite a transforms.json or an input picture.
         ValueError: no camera has a picture, or a lens folds its picture over.
 
     Example:
@@ -74,7 +72,6 @@ def undistort(
     names = numbered([_name(camera.name, i) for i, camera in enumerate(dataset.cameras)])
     paths: list[Path | None] = [folder / "images" / name for name in names]
     _check_apart(folder, paths, dataset.image_paths)
-    _check_own(folder, cameras, names)
     masks: list[Path | None] = [None] * len(cameras)
     for i, (camera, lens, target, source, path) in enumerate(
         zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
@@ -108,14 +105,12 @@ def _write(path: Path, image: npt.NDArray[Any]) -> None:
 
 
 def _check_apart(folder: Path, written: list[Path | None], read: list[Path | None]) -> None:
-    """Refuse to overwrite any input picture, also another camera's, or the transforms.json of the
-    inputs' folder.
-    """
-    scene, place = folder / "transforms.json", folder.resolve()
-    if is_file(scene) and any(path and path.resolve().is_relative_to(place) for path in read):
+    """Refuse to overwrite a transforms.json or any input picture, also another camera's."""
+    scene = folder / "transforms.json"
+    if is_file(scene):
         raise InputError(
-            f"{scene}: stands in the folder of the pictures to undistort; name another folder for"
-            " the result, or remove it if it is an earlier result"
+            f"{scene}: is there; name another folder for the result, or remove it if it is an"
+            " earlier result"
         )
     # Compared by device and inode, so other names and links are recognised.
     files = [path.stat() for path in read if path is not None and is_file(path)]
@@ -128,29 +123,6 @@ def _check_apart(folder: Path, written: list[Path | None], read: list[Path | Non
             raise InputError(
                 f"{path}: is a picture to undistort; name another folder for the result"
             )
-
-
-def _check_own(folder: Path, cameras: list[Camera], names: list[str]) -> None:
-    """Refuse to overwrite a transforms.json unless it is a result of the same cameras."""
-    path = folder / "transforms.json"
-    if not is_file(path):
-        return
-    try:
-        there = read_transforms(path, missing_images="none", points=False)
-        same = len(there.cameras) == len(cameras) and all(
-            (image is None or image.resolve() == (folder / "images" / name).resolve())
-            and np.allclose(old.world_to_camera, new.world_to_camera)
-            for old, image, new, name in zip(
-                there.cameras, there.image_paths, cameras, names, strict=True
-            )
-        )
-    except (InputError, OSError, ValueError):
-        same = False
-    if not same:
-        raise InputError(
-            f"{path}: is of other pictures than these; name another folder for the result, or"
-            " remove it if it is an earlier result"
-        )
 
 
 def _name(name: str, index: int) -> str:

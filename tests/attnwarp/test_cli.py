@@ -777,7 +777,7 @@ def test_undistort_makes_a_data_set_that_fit_takes(data, tmp_path):
     assert done.exit_code == 2 and "attnwarp undistort DATA OUT" in done.stderr
     done = in_process("undistort", data / "bent.json", tmp_path / "flat")
     assert done.exit_code == 0, done.stderr
-    assert "9 pictures, 9 of them undistorted; 32 x 32 px became 34 x 34" in done.stdout
+    assert "9 pictures, 9 of them undistorted" in done.stdout
     assert in_process(*fit, tmp_path / "flat").exit_code == 0
 
 
