@@ -481,27 +481,14 @@ def mask_files(folder: Path, cameras: Any) -> list[Path]:
     numbered as an edit writes it."""
     names = [Path(*(p for p in PurePath(c.name).parts if p not in ("..", "/"))) for c in cameras]
     plain = [name.parent / name.stem for name in names]
-    counts, stems = Counter(plain), Counter(name.stem for name in names)
+    counts = Counter(plain)
     paths: list[Path] = []
     for name, short, numbered in zip(names, plain, file_stems(cameras), strict=True):
-        own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ())]
-        files = (folder / file for file in (*own, f"{numbered}.png"))
-        found = [file for file in files if file.is_file()]
-        if not found:
-            alone = stems[name.stem] == 1
-            path = folder / (f"{numbered}.png" if alone else own[-1])
-            shared = folder / f"{name.stem}.png"
-            if not alone and shared.is_file():
-                first, second = [n for n in names if n.stem == name.stem][:2]
-                raise InputError(
-                    f"--masks: {shared} could be that of {first} or of {second}; expected {path}"
-                )
-            raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
-        if found[0] in paths:
-            other = names[paths.index(found[0])]
+        own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ()), f"{numbered}.png"]
+        path = next((folder / file for file in own if (folder / file).is_file()), None)
+        if path is None:
             raise InputError(
-                f"--masks: {found[0]} could be that of {other} or of {name}; expected one PNG for"
-                " each view, spelled as the view"
+                f"--masks: {folder / own[-1]} is missing; expected one PNG for each view"
             )
-        paths.append(found[0])
+        paths.append(path)
     return paths
