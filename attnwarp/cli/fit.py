@@ -125,14 +125,6 @@ def fit(
     restart: Annotated[
         bool, option("Begin again, over the fit that --out holds.", None, "--restart")
     ] = False,
-    third_scale: Annotated[
-        float | None,
-        option(
-            "Give discs this third scale in the PLY, in scene units, for viewers of 3DGS, such as"
-            " 1e-6 (default: none is written).",
-            "SCALE",
-        ),
-    ] = None,
     *,
     reading: Reading,
 ) -> None:
@@ -148,7 +140,6 @@ def fit(
             raise ValueError(f"--points: got {points}, but --start names the first splats")
         first = None if start is None else _read_start(start, out, kind)
         kind = kind or ("3dgs" if first is not None and first.kind == "3d" else "2dgs")
-        _check_third_scale(third_scale, kind)
         apart = _held_out(hold_out)
         use_threads(threads)
         limits = {"iterations": iterations, "max_splats": max_splats}
@@ -159,7 +150,6 @@ def fit(
         result = _fit(
             data, reading, out, changes, start, first, points, apart, max_size, device, report,
             restart=restart, max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
-            third_scale=third_scale,
         )  # fmt: skip
         from attnwarp.devices import peak_memory
 
@@ -214,15 +204,6 @@ def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:
             f"--start: the fit would write over {start}; name another folder with --out"
         )
     return read_splats(start, kind, None)
-
-
-def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
-    if third_scale is None:
-        return
-    if kind != "2dgs":
-        raise ValueError(f"--third-scale: got {third_scale} for {kind}, which has three")
-    if not 0 < third_scale < float("inf"):
-        raise ValueError(f"--third-scale: got {third_scale}, expected a length such as 1e-6")
 
 
 def _fit(

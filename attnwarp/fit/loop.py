@@ -141,7 +141,6 @@ def fit(
     restart: bool = False,
     max_seconds: float | None = None,
     checkpoint_seconds: float = 30.0,
-    third_scale: float | None = None,
     backend: str = "auto",
     measure: Measure | None = None,
     report: Reporter = SILENT,
@@ -172,8 +171,6 @@ def fit(
             excluded. The learning rates still follow ``settings.iterations``.
         checkpoint_seconds: time between checkpoints; extended for a slow checkpoint, so that
             writing takes 5 % of the time.
-        third_scale: normal scale of 2D splats in ``splats.ply``, for viewers of 3D splats; see
-            :func:`attnwarp.io.write_ply`.
         backend: renderer name, as for :func:`attnwarp.render.render`.
         measure: function of the splats, called at every evaluation; its figures enter the history.
             It can compare with ground truth, such as the error of depth.
@@ -228,14 +225,12 @@ def fit(
     if max_seconds is not None:
         check.seconds(max_seconds, "max_seconds")
     check.seconds(checkpoint_seconds, "checkpoint_seconds")
-    if third_scale is not None and settings.kind != "2d":
-        raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     if settings.max_splats is not None and len(start) > settings.max_splats:
         report.log(
             f"{len(start)} first splats, more than max_splats {settings.max_splats}: the fit keeps"
             " them all and adds none"
         )
-    run = _Run(start, views, settings, held_out, backend, measure, third_scale)
+    run = _Run(start, views, settings, held_out, backend, measure)
     with nullcontext() if folder is None else results_in(Path(folder)) as place:
         if place is not None:
             run.resume(Workdir(place, "a fit"), report, restart=restart)
@@ -253,9 +248,7 @@ class _Run:
         held_out: Views | None,
         backend: str,
         measure: Measure | None,
-        third_scale: float | None,
     ) -> None:
-        self.third_scale = third_scale
         self.settings, self.views, self.held_out = settings, views, held_out
         self.chooses = choosing(len(held_out or ()), settings)
         self.backend, self.measure = backend, measure
@@ -379,7 +372,7 @@ class _Run:
                 "history": [asdict(record) for record in self.history],
             },
         )
-        write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
+        write_ply(self.folder.path / SPLATS, gaussians)
 
     def go(
         self,

@@ -872,19 +872,13 @@ def test_what_is_read_is_not_written_over_by_its_name_or_a_link(data, tmp_path):
     assert (data / "transforms.json").read_bytes() == frames
 
 
-def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
-    done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--third-scale", "1e-5",
-        "--set", "sky=false",
-    )  # fmt: skip
+def test_a_fit_writes_world_coordinates_and_says_what_has_no_surface(data, tmp_path):
+    done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--set", "sky=false")
     assert done.exit_code == 0, done.stderr
-    vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
-    np.testing.assert_allclose(vertex["scale_2"], np.log(1e-5), rtol=1e-6)
     # Splats that begin at an opacity of 0.1 hide nothing.
     assert "% of the pictures' area has no surface" in done.stdout
-    # World coordinates: the blobs are scattered by 0.4 about zero.
-    assert abs(np.mean(vertex["x"])) < 0.5
-    done = in_process("fit", data, "--out", tmp_path, "--kind", "3dgs", "--third-scale", "1e-5")
-    assert done.exit_code == 2 and "--third-scale" in done.stderr
+    # The blobs are scattered by 0.4 about zero.
+    assert abs(np.mean(PlyData.read(tmp_path / "splats.ply")["vertex"]["x"])) < 0.5
 
 
 # -------- pipes, disks, signals, packages
