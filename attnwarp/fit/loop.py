@@ -25,7 +25,7 @@ from attnwarp.fit.exposure import Exposure
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of, upward
-from attnwarp.fit.views import Views, warn_of_twins
+from attnwarp.fit.views import Views
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
@@ -187,8 +187,7 @@ def fit(
             suggests a remedy. The last checkpoint is kept.
 
     Warns:
-        InputWarning: held-out pictures are also fitted on; world coordinates in ``splats.ply``
-            exceed float32's precision.
+        InputWarning: world coordinates in ``splats.ply`` exceed float32's precision.
 
     Example:
         >>> import numpy as np
@@ -203,7 +202,6 @@ def fit(
     check.instance(views, Views, "views", "attnwarp.fit.Views")
     if held_out is not None:
         check.instance(held_out, Views, "held_out", "attnwarp.fit.Views")
-        warn_of_twins(views, held_out)
     if settings is not None:
         check.instance(settings, FitSettings, "settings", "attnwarp.fit.FitSettings")
     settings = (

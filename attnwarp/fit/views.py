@@ -467,9 +467,11 @@ def _apart(train: Dataset, test: Dataset) -> Dataset | None:
     if not again:
         return test
     rest = [i for i in range(len(test)) if i not in again]
+    first, twin = next(iter(again.items()))
     warnings.warn(
-        f"dataset: {_named(again, train.cameras, test.cameras)}; they are not held out"
-        f"{'' if rest else ', which leaves none to measure on'}",
+        f"dataset: {len(again)} of {len(test)} held-out views are fitted on too (first:"
+        f" {test.cameras[first].name!r}, which is {train.cameras[twin].name!r}); they are not held"
+        f" out{'' if rest else ', which leaves none to measure on'}",
         InputWarning,
         stacklevel=3,
     )
@@ -503,23 +505,3 @@ def _twins(fitted: Sequence[Camera], held_out: Sequence[Camera]) -> dict[int, in
     )
     apart = np.abs(poses[len(fitted) :, None] - poses[: len(fitted)]).max(axis=2)
     return {i: int(row.argmin()) for i, row in enumerate(apart) if row.min() <= SAME_POSE}
-
-
-def warn_of_twins(views: Views, held_out: Views) -> None:
-    """Warn of held-out pictures at the poses of fitted views."""
-    again = _twins(views.cameras, held_out.cameras)
-    if again:
-        warnings.warn(
-            f"held_out: {_named(again, views.cameras, held_out.cameras)}, so that their PSNR is not"
-            " one of held-out views; leave them out of one of the two",
-            InputWarning,
-            stacklevel=4,
-        )
-
-
-def _named(again: dict[int, int], fitted: Sequence[Camera], held_out: Sequence[Camera]) -> str:
-    first, twin = next(iter(again.items()))
-    return (
-        f"{len(again)} of {len(held_out)} held-out views are fitted on too (first:"
-        f" {held_out[first].name!r}, which is {fitted[twin].name!r})"
-    )

@@ -13,7 +13,7 @@ from edit_folders import Watched
 from rounding import prepared
 
 from attnwarp import Camera, Gaussians
-from attnwarp.errors import InputError, InputWarning
+from attnwarp.errors import InputError
 from attnwarp.fit import FitSettings, Views, fit, from_points, loop
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.fit.model import Model
@@ -276,14 +276,6 @@ def test_a_world_far_from_its_origin_is_fitted_as_well():
     np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
 
 
-def test_held_out_views_at_fitted_poses_are_said():
-    truth, cameras = blobs(), ring()
-    views, held_out = pictures(truth, cameras[:3]), pictures(truth, cameras[2:4])
-    settings = FitSettings(kind="3d", iterations=1, sh_degree=0)
-    with pytest.warns(InputWarning, match="1 of 2 held-out views are fitted on too"):
-        fit(truth, views, settings, held_out=held_out)
-
-
 def test_float64_splats_far_from_zero_stay_where_they_are():
     # No learning rate, so no splat may move. float32 resolves 1e6 to 0.06; relative to the splats'
     # own middle it resolves 1e-7.
@@ -297,8 +289,7 @@ def test_float64_splats_far_from_zero_stay_where_they_are():
     means = near.means + torch.tensor(offset, dtype=torch.float64)
     far = dataclasses.replace(near, means=means, origin=np.zeros(3))
     views = pictures(far, ring(offset=np.array(offset))[:2])
-    with pytest.warns(InputWarning, match="2 of 2 held-out views are fitted on too"):
-        result = fit(far, views, settings, held_out=views)
+    result = fit(far, views, settings, held_out=views)
     assert np.abs(result.gaussians.world_means() - means.numpy()).max() < 1e-6
     assert result.history[0].psnr > 100
 
