@@ -41,10 +41,6 @@ OWN_OPTIONS = {
 }
 
 
-OVERFITTED = 0.5
-"""Fall of the choosing views' PSNR from its best, dB, that triggers a message; the last evaluations
-of a sound fit differ by less."""
-
 PATIENCE = 4
 """Evaluations without a gain after which a fit with held-out views stops."""
 
@@ -160,7 +156,6 @@ def fit(
             f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
             f" in {result.seconds:.0f} s{peak_memory(str(place))}{held}"
         )
-        _warn_of_overfit(result)
         if result.stopped == "asked":
             report.log("stopped; the same command goes on from here")
             raise typer.Exit(STOPPED)
@@ -175,27 +170,6 @@ def _held_out(text: str) -> int | list[str]:
             "--hold-out: got 1, which leaves nothing to fit on; expected 0, at least 2, or names"
         )
     return int(text)
-
-
-def _warn_of_overfit(result: Fit) -> None:
-    """Report if an earlier evaluation's splats are kept and the last ones are clearly worse."""
-    best, last = result.kept.choosing, result.history[-1].choosing
-    if best is None or last is None or best <= last + OVERFITTED:
-        return
-    remedy = (
-        "the fit learns its pictures by heart; take more of them"
-        if _has_grown(result)
-        else "no splat was added; take more --iterations or --max-splats"
-    )
-    warn(
-        f"the splats of {result.kept.iteration} iterations are kept: views that choose had"
-        f" {best:.2f} dB then, and {last:.2f} in the end: {remedy}"
-    )
-
-
-def _has_grown(result: Fit) -> bool:
-    """Return True if splats were added to the first ones, or were not to be."""
-    return not result.settings.densify or result.kept.splats > result.history[0].splats
 
 
 def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:
@@ -288,7 +262,7 @@ def _fit(
         typer.echo(line)
     seen = views if held_out is None else held_out
     unlike = attnwarp.fit.beside_mean_color(result.gaussians, seen)
-    if line := attnwarp.fit.say_unlike(*unlike, grown=_has_grown(result)):
+    if line := attnwarp.fit.say_unlike(*unlike):
         warn(line)
     return result
 

@@ -53,13 +53,12 @@ def beside_mean_color(gaussians: Gaussians, views: Views) -> tuple[float, float]
     return psnr, plain
 
 
-def say_unlike(psnr: float, plain: float, *, grown: bool = True) -> str:
+def say_unlike(psnr: float, plain: float) -> str:
     """Write a sentence, without its full stop, if splats explain too little of the pictures; else
     an empty one.
 
     Args:
         psnr, plain: results of :func:`beside_mean_color`, in dB.
-        grown: False if the fit added no splats, which more pictures do not mend.
 
     Example:
         >>> from attnwarp.fit.quality import say_unlike
@@ -68,13 +67,8 @@ def say_unlike(psnr: float, plain: float, *, grown: bool = True) -> str:
     """
     if psnr >= plain - 10 * math.log10(1 - EXPLAINED):
         return ""
-    remedy = (
-        "take more iterations or more pictures that overlap"
-        if grown
-        else "take more iterations or a larger max_splats, since no splat was added"
-    )
     return (
         f"the splats hardly know the scene: their renders are {psnr:.1f} dB from the pictures,"
         f" whose own mean colours are {plain:.1f} dB from them; check that the cameras' poses"
-        f" belong to the pictures, and {remedy}"
+        " belong to the pictures, and take more iterations or more pictures that overlap"
     )

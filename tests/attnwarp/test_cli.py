@@ -360,7 +360,7 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
         assert json.loads((out / "settings.json").read_text())["kind"] == kind
 
 
-def test_held_out_views_that_become_worse_are_said(data, tmp_path):
+def test_held_out_views_that_become_worse_choose_the_splats_of_before(data, tmp_path):
     """All pictures are white but the four that are held out: the fit leaves them behind, and the
     splats are kept of before."""
     shutil.copytree(data, tmp_path / "data")
@@ -371,14 +371,9 @@ def test_held_out_views_that_become_worse_are_said(data, tmp_path):
     fit += ["--iterations", 30, "--set", "densify=false", "--set", "lr_opacity=0.2"]
     done = in_process(*fit, "--hold-out", "1,2,3,4.png")
     assert done.exit_code == 0, done.stderr
-    assert "learns its pictures by heart; take more of them" in done.stderr
     history = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
     rows = [json.loads(line) for line in history]
-    first, *_, last = (row["choosing"] for row in rows)
-    assert (
-        f"the splats of 0 iterations are kept: views that choose had {first:.2f} dB" in done.stderr
-    )
-    assert f"and {last:.2f} in the end" in done.stderr
+    assert rows[0]["choosing"] > rows[-1]["choosing"]
     assert f"held-out PSNR {rows[0]['psnr']:.2f} dB" in done.stdout
     assert done.stdout.count("one that chose the splats") == 3
     assert "too few to choose by" not in done.stderr
@@ -387,7 +382,7 @@ def test_held_out_views_that_become_worse_are_said(data, tmp_path):
     fit[3] = tmp_path / "few"
     done = in_process(*fit, "--hold-out", "1,2,3.png")
     assert "held-out views: 3, too few to choose by" in done.stderr
-    assert "one that chose" not in done.stdout and "by heart" not in done.stderr
+    assert "one that chose" not in done.stdout
 
 
 def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):
