@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,9 +28,6 @@ from attnwarp.reporting import reporter
 
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Image
-
-MOST_STRETCH = 0.03
-"""Largest change of a picture's aspect ratio that is not reported."""
 
 PictureEditorOption = Annotated[
     str,
@@ -125,7 +120,6 @@ def edit_image(
     whole = image
     h, w = edit_size(whole.shape[0], whole.shape[1], longest, model.side_multiple)
     image = resized(whole, (h, w))
-    _tell_stretch(whole.shape, image.shape, model.side_multiple)
     share: Any = None
     if mask is not None:
         bright = bright_of(mask, picture, "--mask")
@@ -177,20 +171,6 @@ def _read(path: Path) -> Image:
     stored = read_upright(path)
     values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
     return values[..., :3] * values[..., 3:] if stored.shape[2] == 4 else values
-
-
-def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
-    """Warn if rounding the sides to multiples clearly changes a picture's aspect ratio."""
-    h, w = before[:2]
-    stretch = (after[1] / after[0]) / (w / h)
-    if abs(math.log(stretch)) > math.log(1 + MOST_STRETCH):
-        warnings.warn(
-            f"{w} x {h} px is edited as {after[1]} x {after[0]}, sides that the editor takes"
-            f" (multiples of {multiple}): {max(stretch, 1 / stretch) - 1:.0%} too"
-            f" {'wide' if stretch > 1 else 'high'}; another --size may fit better",
-            InputWarning,
-            stacklevel=1,
-        )
 
 
 def _write(path: Path, image: Image) -> None:
