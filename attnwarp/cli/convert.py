@@ -62,7 +62,6 @@ def convert(
         suffix = out.suffix.lower()
         if suffix not in FORMATS:
             raise ValueError(f"OUT: got {out}, expected a name ending in {', '.join(FORMATS)}")
-        _check_start(source)
         from attnwarp.io import THIRD_SCALE, write_ply, write_splat
         from attnwarp.io.file import check_other
 
@@ -82,18 +81,6 @@ def convert(
         else:
             write_ply(out, splats, third_scale=third_scale, coordinates=coordinates)
         typer.echo(f"{out}: {len(splats)} splats")
-
-
-def _check_start(path: Path) -> None:
-    """Refuse a file without a PLY header, before the seconds of torch's import."""
-    if path.suffix.lower() in (".splat", ".spz", ".sog", ".ksplat") or not path.is_file():
-        return
-    with path.open("rb") as stream:
-        if stream.read(3) != b"ply":
-            raise ValueError(
-                f"{path}: not a PLY file, which begins with 'ply'; expected splats: .ply, .splat,"
-                " .spz, .sog or .ksplat"
-            )
 
 
 @options_of(Reading)
