@@ -189,11 +189,6 @@ class Loaded:
         """A copy with other values of keys."""
         return Loaded(self.manifest.model_copy(update=changes), self.folder)
 
-    def with_rows(self, **changes: Any) -> Loaded:
-        """A copy whose variants have other values of keys."""
-        rows = self.manifest.variants.items()
-        return self.changed(variants={k: row.model_copy(update=changes) for k, row in rows})
-
     def only(self, names: Sequence[str]) -> Loaded:
         """Restrict to some variants, with their editors.
 
@@ -234,24 +229,6 @@ class Loaded:
         }
         kept = [name for name, row in m.variants.items() if row.editor in editors]
         return self.changed(editors={**m.editors, **editors}).only(kept)
-
-    def quick(self) -> Loaded:
-        """Restrict to the first capture, edit and seed, and two variants: the first one that warps
-        attention, and another one, with the same editor if there is one."""
-        m = self.manifest
-        first, *others = sorted(
-            m.variants, key=lambda name: m.variants[name].method != "attention_warping"
-        )
-        editor = m.variants[first].editor
-        others.sort(key=lambda name: m.variants[name].editor != editor)
-        name, capture = next(iter(m.captures.items()))
-        edits = dict([next(iter(capture.edits.items()))])
-        variants = {
-            name: row.model_copy(update={"seeds": self.seeds(row)[:1]})
-            for name, row in m.variants.items()
-        }
-        captures = {name: capture.model_copy(update={"edits": edits})}
-        return self.changed(variants=variants, captures=captures).only([first, *others[:1]])
 
 
 def _from(place: Path, editor: str) -> str:
@@ -322,7 +299,9 @@ def load_manifest(name_or_path: str, one: Mapping[str, Any] | None = None) -> Lo
     loaded = Loaded(manifest, Path() if name_or_path in own else path.parent)
     if one is not None:
         kinds = [kind for capture in manifest.captures.values() for kind in capture.splats]
-        loaded = loaded.with_rows(paper=None, **({"splats": kinds[0]} if kinds else {}))
+        own_keys = {"paper": None, **({"splats": kinds[0]} if kinds else {})}
+        rows = manifest.variants.items()
+        loaded = loaded.changed(variants={k: row.model_copy(update=own_keys) for k, row in rows})
     _check_names(path, lines, loaded.manifest)
     return loaded
 

@@ -13,7 +13,7 @@ from attnwarp.cli.options import Marking, MaxSizeOption, option, options_of
 from attnwarp.cli.shell import fail
 from attnwarp.errors import InputError
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable, whole_numbers
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
 
 ONE = "One capture"
 """Name of the help panel."""
@@ -48,18 +48,6 @@ class One:
     ply: Annotated[
         Path | None, option("Edit these splats (default fitted).", "SPLATS", panel=ONE)
     ] = None
-    images: Annotated[
-        Path | None,
-        option("Read the pictures of a COLMAP model from this folder.", "FOLDER", panel=ONE),
-    ] = None
-    scale: Annotated[
-        int,
-        option(
-            "Read the pictures of images_N, which are so many times smaller: 2, 4 or 8.",
-            "N",
-            panel=ONE,
-        ),
-    ] = 1
     max_size: MaxSizeOption = None
 
     @property
@@ -95,8 +83,8 @@ class One:
             "source": self.source_prompt,
         }  # fmt: skip
         capture = {
-            "data": _place(self.data), "images": _place(self.images), "scale": self.scale,
-            "source": marking.source, "mask": mask if marks.option else None,
+            "data": _place(self.data), "source": marking.source,
+            "mask": mask if marks.option else None,
             "splats": {read_ply(self.ply).kind: _place(self.ply)} if self.ply else {},
             "edits": {self.instruction: edit},
         }  # fmt: skip
@@ -130,15 +118,9 @@ def captures(
             "NAME|FOLDER|BASE,CONTROLNET",
         ),
     ] = None,
-    seeds: Annotated[
-        str | None, option("Only these seeds (comma-separated whole numbers).")
-    ] = None,
     device: Annotated[
         str, option("Where the networks run: cpu, cuda, or one of several, such as cuda:1.")
     ] = "cpu",
-    quick: Annotated[
-        bool, option("One scene, one edit, one seed, two variants.", None, "--quick")
-    ] = False,
     dry_run: Annotated[
         bool,
         option("Check everything, count network rows, and run nothing.", None, "--dry-run"),
@@ -161,13 +143,10 @@ def captures(
 
     if manifest is None and one.data is None:
         raise fail("name a manifest, such as paper, or one capture: --data DIR --instruction TEXT")
-    drawn = whole_numbers(seeds, "--seeds")
     with clear_errors(), reporter(every=True) as report:
         loaded = load_manifest(manifest or "one", one.keys(marking))
         loaded = loaded.with_editors(editor) if editor else loaded
         loaded = loaded.only(variant) if variant else loaded
-        loaded = loaded.with_rows(seeds=drawn) if drawn else loaded
-        loaded = loaded.quick() if quick else loaded
         device_of(device)
         named = one.name if one.data else Path(str(manifest)).stem
         store = Store(out or Path("runs/captures") / named)

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from attnwarp.io import read_ply, write_ply
 from attnwarp_eval.cli.main import app
+from attnwarp_lab.captures.capture import ready
 from attnwarp_lab.captures.cells import settings_of
 from attnwarp_lab.captures.manifest import load_manifest, shipped
 
@@ -138,11 +139,13 @@ def test_the_shipped_manifest_has_the_published_numbers():
     assert ip2p["guidance_drop"] == 1.5 and ip2p["start"] == [700, 980]
 
 
-def test_a_quick_look_keeps_the_seeds_of_the_command_line():
-    loaded = load_manifest("paper")
-    for given, expected in (
-        (loaded.with_rows(seeds=[7, 8]), 7),
-        (loaded, loaded.manifest.seeds[0]),
-    ):
-        rows = given.quick().manifest.variants.values()
-        assert [row.seeds for row in rows] == [[expected], [expected]]
+def test_smaller_copies_of_the_pictures_are_read_by_the_scale_of_a_capture(made, tmp_path):
+    folder, manifest = tmp_path / "copy", copy.deepcopy(MANIFEST)
+    shutil.copytree(made, folder)
+    (folder / "captures/one/images_2").mkdir()
+    for file in (folder / "captures/one/images").iterdir():
+        Image.open(file).resize((16, 16)).save(folder / "captures/one/images_2" / file.name)
+    manifest["captures"]["one"]["scale"] = 2
+    loaded = load_manifest(str(save(folder, manifest)))
+    sizes = [{c.width for c in ready(loaded, name).cameras} for name in ("one", "two")]
+    assert sizes == [{16}, {32}]

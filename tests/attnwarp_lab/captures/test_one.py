@@ -52,13 +52,9 @@ def call(*arguments):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A capture of three views of 32 px, in two scales, its splats, and a manifest."""
+    """A capture of three views of 32 px, its splats, and a manifest."""
     path = tmp_path_factory.mktemp("capture") / "thing"
     write_capture(path)
-    (path / "images_2").mkdir()
-    for file in (path / "images").iterdir():
-        picture = Image.open(file).resize((16, 16), Image.Resampling.BOX)
-        picture.save(path / "images_2" / file.name)
     (path / "mine.yaml").write_text(yaml.safe_dump(MANIFEST, sort_keys=False))
     return path
 
@@ -116,16 +112,6 @@ def test_what_is_left_out_or_cut_is_told_before_and_in_the_report(done):
     assert (out / "report.html").read_text().count("data:image/png") >= 3 * 5
 
 
-@pytest.mark.slow
-def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path):
-    variants = {"every": MANIFEST["variants"]["every"]}
-    (folder / "plain.yaml").write_text(yaml.safe_dump(MANIFEST | {"variants": variants}))
-    done = call(folder / "plain.yaml", "--data", folder, "--ply", folder / "scene.ply", "--scale", 2,
-                "--instruction", "make it red", "--out", tmp_path)  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert read(tmp_path / "originals/thing/view-0000.png").shape == (16, 16, 3)
-
-
 def test_editors_of_ones_own_stand_for_those_of_their_kind_whose_variants_alone_run(
     tmp_path, monkeypatch
 ):
@@ -143,10 +129,6 @@ def test_editors_of_ones_own_stand_for_those_of_their_kind_whose_variants_alone_
     both = loaded.with_editors(["ip2p", "base,control"])
     assert both.editor("depth") == f"{tmp_path / 'base'},{tmp_path / 'control'}"
     assert both.manifest.variants == loaded.manifest.variants
-    quick = loaded.with_rows(seeds=[7, 8]).quick()  # --seeds 7,8 --quick
-    assert {name: quick.seeds(row) for name, row in quick.manifest.variants.items()} == {
-        "attention warping": [7], "each view alone": [7]
-    }  # fmt: skip
 
 
 GIVEN = ("--data", ".", "--instruction", "red")
