@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
-from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import spread
-from attnwarp_eval.statistics.contrasts import paired
-from attnwarp_eval.statistics.intervals import interval, over_scenes
+from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, register_report
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
@@ -18,16 +16,6 @@ from attnwarp_lab.ideal.report import EditorReport
 
 MOST_STAGES = 3
 """Stages of an edit that the figure on depth edges shows."""
-
-DRIFTING = {
-    "ideal": ("ideal editor", "parts with the source's answer", "parts.seen.edit"),
-    "editing": (
-        "bundled editor",
-        "dE00 between views above the floor",
-        "multiview.delta_e_above.edit_inside",
-    ),
-}
-"""Probes of methods whose editor drifts: the editor, what is shown, and its metric."""
 
 
 @register_report
@@ -57,8 +45,8 @@ class IdealReport(EditorReport):
     )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """The editor by scene: share of signal, settling of answers, statistics alone; figures by
-        planted drift; errors at depth edges.
+        """The editor by scene: share of signal, settling of answers, statistics alone; errors at
+        depth edges.
         """
         edges = edges_of(results.study, self.name)
         if edges is not None:
@@ -107,58 +95,3 @@ class IdealReport(EditorReport):
             *self.problems(results),
         ]
         yield Section("The ideal editor", text, [Table(columns, rows)], folded=True)
-        if any("drift" in record.spec for _, record in results.finished(self.name)):
-            yield _drift(results, layout)
-
-
-def _drift(results: Results, layout: Layout) -> Section:
-    """Figures of each method by the shift of its editor; a variant's method is its name up to the
-    first comma.
-    """
-    path, tables = layout.figure("drift.svg"), []
-    shown = {probe: said for probe, said in DRIFTING.items() if results.finished(probe)}
-    with charts.drawing(path, columns=len(shown), height=4.2, width=6.5 * len(shown)) as all_axes:
-        for axes, (probe, (editor, what, key)) in zip(all_axes, shown.items(), strict=True):
-            found: dict[str, dict[float, dict[str, dict[str, float]]]] = {}
-            for cell, record in results.finished(probe):
-                shift = record.spec.get("drift", {"shift": 0.0})["shift"]
-                by_shift = found.setdefault(cell.variants[0].partition(",")[0], {})
-                values = {f"{cell.seed}/{view.name}": view.metrics[key] for view in record.views}
-                by_shift.setdefault(shift, {}).setdefault(cell.scene, {}).update(values)
-            means = {
-                name: {shift: over_scenes(by[shift]) for shift in sorted(by)}
-                for name, by in found.items()
-            }
-            shifts = sorted({shift for by in means.values() for shift in by})
-            alone = next(iter(found.values()))
-            gains = {
-                name: {shift: paired(alone.get(shift, {}), by[shift]) for shift in sorted(by)}
-                for name, by in found.items()
-            }
-            series = [charts.Line(name, list(by), list(by.values())) for name, by in gains.items()]
-            charts.lines(axes, series, x="planted shift, px", y=f"gain: {what}", title=editor)
-            count = len(results.study.scenes)
-            rows = [
-                [
-                    name,
-                    *(
-                        spread(of[name][shift], count) if shift in of[name] else ""
-                        for of in (means, gains)
-                        for shift in shifts
-                    ),
-                ]
-                for name in found
-            ]
-            columns = ["method", *(f"{w}{s:g} px" for w in ("", "gain, ") for s in shifts)]
-            tables.append(Table(columns, rows, f"{editor}: {what}"))
-    text = (
-        "An editor that moves every picture it edits by this shift, each view in a direction of its"
-        f" own; pictures are of {results.study.size} px. Warps assume that it stays. **Gain**: the"
-        " difference from the first row at the same shift, paired by scene; less is better of dE00."
-        " A shifted picture shows background and other parts at a part's place, so views alone"
-        " agree more by chance too. Only edits whose source shows a right answer count, so rows"
-        " stand on different scenes. Of fewer than six a bracket holds the least and the most."
-    )
-    picture = Picture("figures/drift.svg", "Gain over views alone, by the drift of the editor.")
-    title = "How much drift does each method stand?"
-    return Section(title, [text], tables, [picture], leads=True)
