@@ -6,9 +6,7 @@ they "accumulate alignment errors in geometrically discontinuous regions".
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+from collections.abc import Mapping
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
@@ -72,8 +70,6 @@ def edge_section(
     layout: Layout,
     probe: str,
     metrics: Mapping[str, Figures],
-    beside: Mapping[str, Sequence[tuple[float, ByView]]] | None = None,
-    axis: str = "",
 ) -> Section | None:
     """Section on depth edges: one figure and one table; None if not asked for.
 
@@ -81,31 +77,23 @@ def edge_section(
         results, layout: run and layout of the report.
         probe: name of the probe.
         metrics: figures by row.
-        beside: line -> (x, shares), of the figure's second panel; None for one panel.
-        axis: title of that panel's x axis.
     """
     if edges_of(results.study, probe) is None or not results.finished(probe):
         return None
-    path, away = layout.figure(f"edges-{probe}.svg"), range(FAR + 1)
+    path, distances = layout.figure(f"edges-{probe}.svg"), range(FAR + 1)
     near = [
         charts.Line(
             title,
-            away,
+            distances,
             [over_scenes(results.views(probe, name, right.format(p))) for p in PLACES],
         )
         for title, (name, right, _) in metrics.items()
     ]
-    further = [
-        charts.Line(name, [x for x, _ in line], [over_scenes(table) for _, table in line])
-        for name, line in (beside or {}).items()
-    ]
-    further = [line for line in further if sum(np.isfinite(y.mean) for y in line.y) > 1]
-    panels = [(near, "tokens to the nearest depth edge"), *[(further, axis)] * bool(further)]
-    with charts.drawing(path, columns=len(panels)) as axes:
-        for place, (series, x) in zip(axes, panels, strict=True):
-            charts.lines(
-                place, series, x=x, y="share that is right", title="", share=True, apart=0.05
-            )
+    with charts.drawing(path) as (axes,):
+        charts.lines(
+            axes, near, x="tokens to the nearest depth edge", y="share that is right", title="",
+            share=True, apart=0.05,
+        )  # fmt: skip
     picture = Picture(f"figures/{path.name}", "Right tokens by distance to a depth edge")
     title = "Do carried features err at depth edges?"
     return Section(title, [TEXT], edge_tables(results, probe, metrics), [picture], leads=True)

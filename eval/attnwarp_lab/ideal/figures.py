@@ -142,7 +142,6 @@ def part_figures(
     visible: Mask,
     hidden: Mask,
     before_it: Labels,
-    places: Mapping[str, Mask] | None = None,
 ) -> dict[str, float]:
     """Figures of one target view, given the source's answers.
 
@@ -152,7 +151,6 @@ def part_figures(
         visible: (H, W) bool, the source certainly shows the pixel's surface.
         hidden: (H, W) bool, the surface is inside the source image and certainly hidden.
         before_it: (H, W) part of the surface that the source shows there instead; -1 for none.
-        places: (h, w) tokens counted together, by the end of further figures' names.
 
     Returns:
         ``parts.seen``: share of the parts truly seen by the source that show the source's answer;
@@ -160,9 +158,8 @@ def part_figures(
         by chance 1/K;
         ``parts.bleed``: mean CIEDE2000 to the picture before, outside the thing;
         ``parts.delta_e``: mean CIEDE2000 to the truth of the source's answers, at pixels truly
-        seen; and the counts ``parts.seen_parts`` and ``parts.hidden_pixels``. By place,
-        ``parts.right``, the share of the pixels truly seen that show the source's answer, and
-        ``parts.through``. NaN where there is nothing to measure.
+        seen; and the counts ``parts.seen_parts`` and ``parts.hidden_pixels``. NaN where there is
+        nothing to measure.
     """
     parts = len(answers)
     there = part_answers(picture, truth, parts, visible)
@@ -173,14 +170,7 @@ def part_figures(
     source = answered(truth, answers)
     seen = visible & (truth.pixels >= 0) & np.isfinite(source).all(axis=-1)
     edited = np.asarray(picture, dtype=np.float64)
-    further: dict[str, float] = {}
-    right, passed = shown == answers[truth.pixels], shown == front
-    for place, tokens in (places or {}).items():
-        at = np.kron(tokens, np.ones((len(seen) // len(tokens),) * 2)) > 0
-        for key, hit, of in (("right", right, seen & at), ("through", passed, asked & at)):
-            further[f"parts.{key}.{place}"] = share(int(hit[of].sum()), int(of.sum()))
     return {
-        **further,
         "parts.seen": share(int((there == answers)[known].sum()), int(known.sum())),
         "parts.through": share(int((shown == front)[asked].sum()), int(asked.sum())),
         "parts.bleed": color_difference(edited, truth.before.astype(np.float64), truth.outside),

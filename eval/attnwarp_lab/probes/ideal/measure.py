@@ -32,8 +32,6 @@ from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
-from attnwarp_lab.ideal.edges import EdgesPart, among, edges_of
-from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.figures import fill_figures, part_answers, part_figures
 from attnwarp_lab.ideal.paint import EDIT
 from attnwarp_lab.ideal.recorded import EditorResult, with_ideal_editor
@@ -66,12 +64,10 @@ class IdealProbe(MethodProbe[IdealResult]):
 
     name = "ideal"
     protocol = 2
-    study_part = EdgesPart
     metrics = metrics_of("parts.", "edit.drift")
 
     def check(self, study: Study) -> None:
         """Require the ideal editor for every variant, and a method that it supports."""
-        edges_of(study, self.name)
         for name, variant in with_ideal_editor(study, self.name):
             own = variant.part(VariantPart)
             if own.method in UNABLE:
@@ -84,7 +80,6 @@ class IdealProbe(MethodProbe[IdealResult]):
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
         """Cells: one for each scene, variant and seed."""
-        edges = edges_of(study, self.name)
         for name, scene in scenes.items():
             thing = thing_of(study, scene)
             for label in names:
@@ -95,7 +90,6 @@ class IdealProbe(MethodProbe[IdealResult]):
                         **self.variant_spec(study, study.variants[label], noise_seed(scene, seed)),
                         **other,
                         "thing": thing,
-                        **({"edges": True} if edges and label in edges.named else {}),
                     }
                     yield Cell(spec, name, label, self.name, seed, (label,), sources=files)
 
@@ -141,15 +135,11 @@ class IdealProbe(MethodProbe[IdealResult]):
             if spec["settings"]["iterations"]:  # else the scene is unchanged
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
-            stages = {names[v]: n for n, part in enumerate(result.rounds, 1) for v in part.views}
             answered = {v: part_answers(edited[v], thing.truth(v), thing.parts) for v in names[1:]}
             fill = fill_figures(answered, answers)
             for name in names[1:]:
-                row = self._figures(world, thing, name, pictures, answers, "edges" in spec)
+                row = self._figures(world, thing, name, pictures, answers)
                 row |= {f"{key}.edit": value for key, value in fill[name].items()}
-                if "parts.right.all.edit" in row:
-                    stage = stages.get(name, 1)
-                    row[f"parts.right.stage{stage}.edit"] = row["parts.right.all.edit"]
                 work.add(f"parts/{name}", row | {"edit.drift": result.drift})
         inside = [labels[labels >= 0] for labels in thing.labels.values()]
         counts = [np.unique(own, return_counts=True)[1] for own in inside]
@@ -179,18 +169,15 @@ class IdealProbe(MethodProbe[IdealResult]):
         name: str,
         pictures: Mapping[str, Mapping[str, Image]],
         answers: npt.NDArray[np.int64],
-        edges: bool,
     ) -> dict[str, float]:
         pair = world.pair(name, world.source.width)
         front = in_front(pair, thing.labels[world.source.name])
-        h, w = (side // FACTOR for side in pair.visible.shape)
-        places = among(pair.hits.depth, (h, w)) if edges else None
         row: dict[str, float] = {}
         for kind, images in pictures.items():
             if name in images:
                 figures = part_figures(
                     images[name], thing.truth(name), answers, pair.visible, pair.label == HIDDEN,
-                    front, places,
+                    front,
                 )  # fmt: skip
                 row |= {f"{key}.{kind}": value for key, value in figures.items()}
         return row

@@ -10,12 +10,7 @@ from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, register_report
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.ideal.edge_report import edge_section
-from attnwarp_lab.ideal.edges import edges_of
 from attnwarp_lab.ideal.report import EditorReport
-
-MOST_STAGES = 3
-"""Stages of an edit that the figure on depth edges shows."""
 
 
 @register_report
@@ -45,23 +40,7 @@ class IdealReport(EditorReport):
     )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
-        """The editor by scene: share of signal, settling of answers, statistics alone; errors at
-        depth edges.
-        """
-        edges = edges_of(results.study, self.name)
-        if edges is not None:
-            own = "parts.right.{}.edit", "parts.through.{}.edit"
-            metrics = {name: (name, *own) for name in edges.named}
-            stages = {
-                name: [
-                    (stage, results.views(self.name, name, f"parts.right.stage{stage}.edit"))
-                    for stage in range(1, MOST_STAGES + 1)
-                ]
-                for name in edges.named
-            }
-            section = edge_section(results, layout, self.name, metrics, stages, "stage of the edit")
-            if section is not None:
-                yield section
+        """The editor by scene: share of signal, settling of answers, statistics alone."""
         found: dict[tuple[object, ...], dict[str, dict[str, list[float]]]] = {}
         for cell, record in results.finished(self.name):
             ideal, extra, steps = (

@@ -21,7 +21,7 @@ from attnwarp_eval.study.shared.edits import VariantPart
 from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 from attnwarp_eval.two_view import TwoView
-from attnwarp_lab.ideal.edges import PLACES, among, edges_of
+from attnwarp_lab.ideal.edges import PLACES, EdgesPart, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.labels import Labels as LabelMap
 from attnwarp_lab.ideal.labels import Mask, carried_labels, label_transport
@@ -46,7 +46,7 @@ class Labels(Part):
     )
 
 
-class StudyPart(Part):
+class StudyPart(EdgesPart):
     """Keys of a study that only this probe reads."""
 
     labels: Labels = Labels()
