@@ -7,7 +7,6 @@ masks/                pixels that took injected features (attention warping)
 segments/             edited region of each view, if segments are given
 views/NAME.png        last edit of each view
 renders/before/ after/  renders of the scene from every view
-sheet.png             renders before, edits and renders after, side by side
 cut.json              budget limit that ended the run, and its round; absent if no limit did
 edited.ply, result.json, times.json: splats; change, drift, counters, Edit PSNR; seconds by part
 """
@@ -41,7 +40,6 @@ from attnwarp.methods.pictures import (
     Bytes,
     Image,
     full_size,
-    labelled,
     to_bytes,
 )
 from attnwarp.methods.scene import (
@@ -64,14 +62,11 @@ FOLDERS = ("rounds", "masks", "segments", "views", "renders/before", "renders/af
 VIEWER_PLY = "edited-3dgs.ply"
 """Edited 2D splats as thin 3D splats, for viewers of 3DGS; the command writes this file."""
 
-RESULTS = ("edited.ply", VIEWER_PLY, "result.json", "sheet.png")
+RESULTS = ("edited.ply", VIEWER_PLY, "result.json")
 """Result files in the manifest's folder."""
 
 BUDGETED = ("warp", "edit", "tune")
 """Timed parts that count toward a budget; writing files and renders does not."""
-
-SHEET_VIEWS = 8
-"""Number of views on the sheet, evenly spread."""
 
 
 class Options(TypedDict, total=False):
@@ -596,7 +591,6 @@ class _Run:
                     if not self.folder.has(path):
                         picture = render_picture(model, camera, self.work.near, self.work.backend)
                         self.folder.write_picture(path, to_bytes(picture))
-            self.folder.write_picture("sheet.png", self._sheet())
             psnr = self._edit_psnr(final)
             change = change_of(self.work, self.names, self.method.about.get("source"), edited)
         records = {
@@ -660,22 +654,6 @@ class _Run:
             if not self.folder.has(path):
                 share = np.repeat(segment[..., None].astype(np.float32), 3, axis=2)
                 self.folder.write_picture(path, to_bytes(share))
-
-    def _sheet(self) -> Bytes:
-        """Draw rows: renders before, edits, renders after. Columns: the source and edited views."""
-        source = self.method.about.get("source")
-        edited = [name for name in self.names if self.folder.has(f"views/{name}.png")]
-        others = [name for name in edited or self.names if name != source]
-        first = [source] if source in edited else []
-        room = min(SHEET_VIEWS - len(first), len(others))
-        shown = [*first, *(others[k * len(others) // room] for k in range(room))]
-        parts = {"before": "renders/before", "edit": "views", "after": "renders/after"}
-        rows = {
-            title: [self.folder.read_picture(f"{part}/{name}.png") for name in shown]
-            for title, part in parts.items()
-            if edited or part != "views"
-        }
-        return labelled(rows, [f"{name} (source)" if name in first else name for name in shown])
 
     # --- progress
 

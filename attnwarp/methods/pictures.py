@@ -1,8 +1,7 @@
-"""Pictures of views: sizes, segments, masks, and sheets of them."""
+"""Pictures of views: sizes, segments, and masks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -131,45 +130,3 @@ def mask_picture(mask: Tensor) -> Bytes:
     """Draw a mask, (H, W, 3) uint8: True is white."""
     pixels = 255 * mask.to(torch.uint8).cpu().numpy()
     return np.repeat(pixels[..., None], 3, axis=2)
-
-
-TILE = 160, 480
-"""Least and largest height in px of a sheet's pictures, so that labels have room."""
-
-
-def labelled(rows: Mapping[str, Sequence[Bytes]], columns: Sequence[str]) -> Bytes:
-    """Arrange pictures in a grid with the names of its rows and columns, (H, W, 3) uint8.
-
-    Args:
-        rows: (h, w, 3) uint8 pictures by the row's name, one for each column.
-    """
-    from PIL import Image as Drawing
-    from PIL import ImageDraw, ImageFont
-
-    h, w = next(iter(rows.values()))[0].shape[:2]
-    least, most = TILE
-    scale = -(-least // h) if h < least else min(1.0, most / h)
-    h, w, line, side = round(scale * h), round(scale * w), 24, 64
-    size = (side + len(columns) * w, line + len(rows) * h)
-    sheet, font = Drawing.new("RGB", size, "white"), ImageFont.load_default(14)
-    draw = ImageDraw.Draw(sheet)
-    for k, name in enumerate(columns):
-        while name and font.getlength(name) > w - 4:
-            name = name[1:]  # the ends of views' names differ
-        draw.text((side + k * w + 2, 4), name, "black", font)
-    for number, (title, pictures) in enumerate(rows.items()):
-        draw.text((4, line + number * h + 4), title, "black", font)
-        for k, pixels in enumerate(pictures):
-            tile = enlarged(pixels, (h, w)) if pixels.shape[0] < h else to_bytes(
-                resized(pixels.astype(np.float32) / np.float32(255), (h, w))
-            )  # fmt: skip
-            sheet.paste(Drawing.fromarray(tile), (side + k * w, line + number * h))
-    return np.asarray(sheet)
-
-
-def enlarged(pixels: Bytes, size: Size) -> Bytes:
-    """Enlarge each pixel to a block, for viewing."""
-    import cv2
-
-    blocks = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(blocks, dtype=np.uint8)
