@@ -82,8 +82,7 @@ def show_edit(
         origin: sentence on the origin of the inputs, without its full stop.
     """
     page = _Page(folder, views, before)
-    # A method that edits views alone needs no control.
-    if editor is not None and page.manifest["method"] != "by_view":
+    if editor is not None:
         shown = [page.names.index(name) for name in page.shown]
         edited_alone(folder, before, views, page.segments, editor, shown, report)
     turns = [renders(model, page.turn) for model in (before, page.after)]

@@ -20,10 +20,6 @@ from attnwarp.io import read_ply
 from attnwarp.io.names import file_stems
 from attnwarp.methods.algorithms.attention_warping import AttentionWarping, RecordedSource
 from attnwarp.methods.algorithms.by_view import ByView, ByViewSettings
-from attnwarp.methods.algorithms.dge import DGE
-from attnwarp.methods.algorithms.gaussctrl import GaussCtrl
-from attnwarp.methods.algorithms.guided import Guided
-from attnwarp.methods.algorithms.igs2gs import IGS2GS
 from attnwarp.methods.base import Edit, edit_file
 from attnwarp.methods.pictures import Bytes, Segment, to_bytes
 from attnwarp.methods.scene import near_of
@@ -38,16 +34,14 @@ CONTROL = "control"
 """Folder of the views edited alone."""
 
 
-NOTHING_CARRIED: dict[str, dict[str, Any]] = {
-    "attention_warping": {"a0": 0.0, "unseen": "free", "reference": "none"},
-    "dge": {"plain_below": 1000},
-    "gaussctrl": {"self_share": 1.0, "control_share": None},
-    "guided": {"below": 0},
-    "igs2gs": {},
-}
-"""Settings with which a view's edit takes nothing from another view's, by the method's name. Other
+NOTHING_CARRIED = {"a0": 0.0, "unseen": "free", "reference": "none"}
+"""Settings of attention warping with which a view's edit takes nothing from another view's. Other
 methods' controls are :func:`attnwarp.methods.by_view`'s edits.
 """
+
+CONTROLLED = ("attention_warping", "corresponding", "fused", "warped_reference")
+"""Methods whose views have a control. Others begin at renders or draw keys, and edit no view alone
+with all else equal."""
 
 
 def edited_alone(
@@ -66,9 +60,11 @@ def edited_alone(
         views: numbers of the views; views already in the folder are kept.
     """
     manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
+    if (name := manifest["method"]) not in CONTROLLED:
+        return
     (folder.path / CONTROL).mkdir(parents=True, exist_ok=True)
     files = {view: f"{CONTROL}/{names[view]}.png" for view in views}
-    source, name = manifest.get("source"), manifest["method"]
+    source = manifest.get("source")
     shown = {names[view]: view for view in views}
     if source in shown and name in ("attention_warping", "warped_reference"):
         # It takes nothing from another view, and may have been made elsewhere.
@@ -77,8 +73,9 @@ def edited_alone(
     left = [view for view in views if not folder.has(files[view])]
     if not left:
         return
-    kind = type(next(iter(PRESETS[name].values())))
-    settings: Any = kind.from_dict({**manifest["settings"], **NOTHING_CARRIED.get(name, {})})
+    given, kind = manifest["settings"], type(next(iter(PRESETS[name].values())))
+    carrying = NOTHING_CARRIED if name == "attention_warping" else {}
+    settings: Any = kind.from_dict({**given, **carrying})
     work = Work(
         gaussians, scene, editor, manifest["instruction"], settings, "auto", folder, report,
         segments,
@@ -88,16 +85,10 @@ def edited_alone(
         method = AttentionWarping(work, settings, names.index(source), None, None, "cpu")
         edited = folder.read_picture(f"views/{source}.png").astype(np.float32) / np.float32(255)
         method.keep(RecordedSource(edited, None))
-    elif name == "guided":
-        first = manifest["rounds"][0]["views"][0]
-        method = Guided(work, settings, names.index(first), None)
-    elif name in NOTHING_CARRIED:
-        method = {"dge": DGE, "gaussctrl": GaussCtrl, "igs2gs": IGS2GS}[name](work, settings)
     else:
-        given = manifest["settings"]
         shared = {field.name for field in fields(ByViewSettings)} & given.keys()
         method = ByView(work, ByViewSettings.from_dict({name: given[name] for name in shared}))
-    loop = _Control(work, files, left, from_tuned=name != "igs2gs")
+    loop = _Control(work, files, left)
     if isinstance(method, ByView):
         loop.last = dict.fromkeys(left, 0)
     method.run(loop)
@@ -108,13 +99,10 @@ class _Control:
 
     Args:
         files: path in the run's folder of each view's edit.
-        from_tuned: True edits with the splats of the run's rounds, False with those before.
     """
 
-    def __init__(
-        self, work: Work, files: Mapping[int, str], left: Sequence[int], from_tuned: bool
-    ) -> None:
-        self.work, self.files, self.left, self.from_tuned = work, files, left, from_tuned
+    def __init__(self, work: Work, files: Mapping[int, str], left: Sequence[int]) -> None:
+        self.work, self.files, self.left = work, files, left
         names, has = file_stems(work.views.cameras), work.folder.has
         rounds = range(len(work.folder.read_json(MANIFEST)["rounds"]))
         self.last = {
@@ -130,7 +118,7 @@ class _Control:
         done = sum(self.work.folder.has(self.files[view]) for view in self.left)
         self.work.report.step(done, len(self.left), "control: each view of the page edited alone")
         model, tuned = self.work.frozen, self.work.folder.path / f"rounds/{number}.ply"
-        if number and self.from_tuned and tuned.is_file():
+        if number and tuned.is_file():
             model = read_ply(tuned)
         for view, one in zip(views, edit(model, lambda: None), strict=True):
             if view in wanted:

@@ -160,9 +160,6 @@ RELEASED = preset("attention_warping", "released", stages=2, views_per_stage=2, 
     ("method", "changes", "edits_alone"),
     [
         ("attention_warping", {**RELEASED, **QUICK}, "views"),
-        ("dge", {"grid": "scheduler", "plain_below": 1000, "every": 2}, "views"),
-        ("igs2gs", {"grid": "scheduler", "iterations": 0}, "views"),
-        ("guided", {"below": 0}, "views"),
         ("fused", {"grid": "scheduler", "perceptual": 0.0}, "rounds/1"),
     ],
 )
@@ -190,8 +187,9 @@ def test_the_page_says_so_where_views_edited_alone_agree_as_well(warped, scene, 
     assert ("the views agree as well" in text) == agree
 
 
-def test_a_method_that_edits_views_alone_has_no_other_control(edits):
-    folder, text = edits("by_view", steps=1)
+@pytest.mark.parametrize("method", ["by_view", "igs2gs"])
+def test_a_method_that_edits_views_alone_or_from_renders_has_no_control(method, edits):
+    folder, text = edits(method, steps=1)
     assert not (folder / "control").exists() and "edited alone" not in text
 
 
