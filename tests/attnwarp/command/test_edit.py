@@ -45,7 +45,6 @@ from attnwarp.errors import InputError
 from attnwarp.fit.views import to_float
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
-from attnwarp.methods import PRESETS
 from attnwarp.methods.change import net_change
 from attnwarp.methods.scene import near_of
 from attnwarp.methods.tuning import Tuning
@@ -407,28 +406,6 @@ def test_a_mask_of_another_shape_is_refused_and_one_of_another_size_is_not(tmp_p
         read_mask(path, view)
 
 
-@pytest.mark.parametrize("turn", range(1, 9))
-def test_masks_and_pictures_by_hand_are_turned_as_viewers_turn_them(tmp_path, turn):
-    """Oracle: Pillow's own turning."""
-    random = np.random.default_rng(turn)
-    shown = 255 * random.integers(0, 2, (12, 20), dtype=np.uint8)
-    tags = PIL.Image.Exif()
-    tags[0x112] = turn
-    # Turning back what is shown gives what is stored.
-    back = {6: 8, 8: 6}.get(turn, turn)
-    undo = PIL.Image.Exif()
-    undo[0x112] = back
-    PIL.Image.fromarray(shown).save(tmp_path / "shown.png", exif=undo)
-    with PIL.Image.open(tmp_path / "shown.png") as picture:
-        stored = PIL.ImageOps.exif_transpose(picture)
-    stored.info.clear()
-    stored.save(tmp_path / "mask.png", exif=tags)
-    view = Camera.look_at((3, 0, 0), (0, 0, 0), width=20, height=12, fov_y=40)
-    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", view), shown > 0)
-    pixels, _ = read_over_black(tmp_path / "mask.png")
-    np.testing.assert_array_equal(pixels[..., 0], shown)
-
-
 @pytest.mark.parametrize(("of_view", "of_mask"), [(1, 3), (3, 3), (3, 1), (6, 6), (1, 2), (6, 3)])
 def test_a_mask_with_the_tag_of_its_view_lies_as_the_view_does(tmp_path, of_view, of_mask):
     """Oracle: the stored pixels where both have the tag, and else Pillow's own turning."""
@@ -787,13 +764,6 @@ def test_extended_takes_half_of_the_steps_of_small_plain_and_all_else_its_own_nu
     given = (place / "data", "--instruction", "make it red", "--editor", editor or place / "editor")
     result = runner.invoke(app, ["edit", *map(str, given), "--out", str(tmp_path), *more])
     assert f"steps: {steps}\n" in result.output
-
-
-def test_the_commands_help_names_every_preset():
-    text = runner.invoke(app, ["edit", "--help"], env={"COLUMNS": "300"}).output
-    joined = re.sub(r"[│\s]", "", text)
-    for name in PRESETS["attention_warping"]:
-        assert name in joined
 
 
 def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):

@@ -4,7 +4,6 @@ wrong.
 
 import dataclasses
 import itertools
-import json
 
 import numpy as np
 import pytest
@@ -627,11 +626,6 @@ def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
         RuntimeError, match="check that cameras and points are in one coordinate system"
     ):
         fit(start, scene[0], settings)
-
-
-def test_settings_survive_json():
-    settings = FitSettings(kind="3d", max_splats=1000, ssim=0.35, patience=3)
-    assert FitSettings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
 
 
 @pytest.mark.door

@@ -66,19 +66,6 @@ def test_frames_find_their_images(tmp_path, spell):
     assert not any(set("/\\") & set(stem) for stem in file_stems(data.cameras))
 
 
-def test_smaller_copies_and_the_points_are_found_too(tmp_path):
-    write_images(tmp_path)
-    write_images(tmp_path, [name.replace("images", "images_2") for name in NAMES], factor=2)
-    (tmp_path / "points").mkdir()
-    text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
-    (tmp_path / "points/a.ply").write_text(f"{text}property float z\nend_header\n1 2 3\n")
-    names = [SPELLINGS["windows"](name) for name in NAMES]
-    path = transforms(tmp_path, names, ply_file_path=".\\points\\a.ply")
-    data = read_transforms(path, scale=2)
-    assert colours(data) == [1, 2, 3] and data.cameras[0].width == 4
-    assert data.points.tolist() == [[1, 2, 3]]
-
-
 @pytest.mark.parametrize("spell", ["windows", "mixed"])
 def test_the_images_of_a_colmap_model_are_found(tmp_path, spell):
     write_images(tmp_path)

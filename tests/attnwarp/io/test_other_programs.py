@@ -89,6 +89,9 @@ def we_read_what_gsplat_exports(tmp_path):
     )  # fmt: skip
     back = read_ply(tmp_path / "a.ply")
     assert back.kind == "3d" and torch.equal(back.sh, g.sh) and torch.equal(back.means, g.means)
+    # float32 logarithms on both ways.
+    torch.testing.assert_close(back.scales, g.scales, rtol=2e-6, atol=0)
+    torch.testing.assert_close(back.opacities, g.opacities, rtol=2e-6, atol=0)
 
 
 def we_read_what_pycolmap_writes(tmp_path):

@@ -161,29 +161,6 @@ def test_points_before_a_fold_are_found_however_far_the_lens_moves_them(k1, k2, 
     assert undistorted_camera(Camera(K, np.eye(4), 64, 8), lens).width < 64
 
 
-def test_coefficients_that_fold_the_picture_over_are_refused():
-    with pytest.raises(ValueError, match=r"lens: .* fold the picture of camera 'a.png' over"):
-        undistorted_camera(camera_of("OPENCV"), Lens("brown", (-3.0, 0.0)))
-
-
-@pytest.mark.door
-@pytest.mark.parametrize("focal", [300.0, 800.0, 1200.0, 2000.0])
-def test_a_fold_inside_the_picture_is_refused_where_only_the_border_has_an_inverse(focal):
-    # r (1 - 1.5 r^2 + r^4) rises up to 0.354 at r = 0.632 and falls from there on; 1 - 1.5 r^2
-    # + r^4 is never 0, so it rises again and every border has an inverse.
-    r = np.linspace(0, 1, 100001)
-    v = r * (1 - 1.5 * r**2 + r**4)
-    largest = v[: np.argmax(np.diff(v) < 0) + 1].max()
-    camera = Camera(np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]]), np.eye(4), 640, 480)
-    lens, corner = Lens("brown", (-1.5, 1.0)), np.hypot(319.5, 239.5) / focal
-    if corner < largest:
-        assert undistorted_camera(camera, lens).width > 640
-    else:
-        assert focal < 1000
-        with pytest.raises(ValueError, match="fold the picture"):
-            undistorted_camera(camera, lens)
-
-
 def first_turn(k):
     """First radius at which r (1 + k1 r^2 + ...), or an angle's polynomial, turns."""
     slope = [0.0] * (2 * len(k) + 1)

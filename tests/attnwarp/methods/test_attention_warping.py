@@ -318,18 +318,6 @@ def test_the_folder_holds_what_a_person_wants(finished, scene):
     assert all(value > 0 for value in seconds.values())
 
 
-def test_counters_are_what_was_done(scene, editor):
-    settings = replace(QUICK, batch=2)
-    rows, result = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
-    assert result.counters["network_rows"] == sum(rows) == 5 * 2 * 3
-    assert result.counters["iterations"] == 6
-    assert result.counters["views"] == 5
-    # Each view alone takes the same passes: carrying the edit asks nothing more of the network.
-    settings = replace(settings, a0=0.0, iterations=0)
-    alone, _ = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
-    assert alone == rows
-
-
 @pytest.mark.parametrize(
     "changes",
     [

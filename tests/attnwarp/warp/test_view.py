@@ -190,41 +190,6 @@ def test_the_truths_own_surface_warps_to_within_a_thousandth_of_a_pixel():
     assert view.at((32, 32)) is layer
 
 
-def test_every_rule_can_be_varied_alone():
-    source, target = orbit(0, size=32), orbit(40, size=32)
-    (depth, normal), (source_depth, source_normal) = sphere(target), sphere(source)
-    image = np.zeros((32, 32, 3))
-    seen = [
-        Surface(d, n, np.isfinite(d) * 1.0, image)
-        for d, n in ((depth, normal), (source_depth, source_normal))
-    ]
-    bare = WarpSettings(
-        in_front=False,
-        opaque=None,
-        depth_agreement=False,
-        normal_test="none",
-        photometric=None,
-        segment=False,
-    )
-    run = lambda s, **more: warp_surfaces(source, target, *seen, s, **more)  # noqa: E731
-    assert list(run(bare).rules) == ["defined", "in_bounds"]
-    segment = torch.zeros(32, 32, dtype=torch.bool)
-    for change, rule in (
-        ({"in_front": True}, "in_front"),
-        ({"opaque": 0.5}, "opaque"),
-        ({"depth_agreement": True}, "depth_agrees"),
-        ({"photometric": 0.2}, "photometric"),
-        ({"normal_test": "facing"}, "facing"),
-        ({"normal_test": "camera_frame"}, "camera_frame"),
-        ({"normal_test": "source_incidence"}, "source_incidence"),
-        ({"segment": True}, "segment"),
-    ):
-        edited = segment if rule == "segment" else None
-        view = run(dataclasses.replace(bare, **change), target_segment=edited)
-        assert list(view.rules) == ["defined", "in_bounds", rule]
-        assert view.mask.any() == (rule != "segment")
-
-
 @dataclasses.dataclass(frozen=True)
 class LimitedSettings(WarpSettings):
     farthest: Weight | None = None
