@@ -18,7 +18,6 @@ from attnwarp.command.marks import (
     HOW,
     MARKED,
     Marks,
-    check_middle,
     lifted_segments,
     pairs,
     read_mask,
@@ -337,7 +336,6 @@ def marked(
                 f"{marks.option}: lifted through the splats, what it marks covers no pixel of any"
                 f" view; mark more, by {HOW}, or all views by --masks"
             )
-        check_middle(marks, mask, camera.width / size[0], lifted[index])
         return lifted
 
     return segments

@@ -15,7 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
-from attnwarp.editing.segment import CORE, Mask, cut_out, load_segmenter, segments_of, snap
+from attnwarp.editing.segment import Mask, cut_out, load_segmenter, segments_of, snap
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.fit import Views
 from attnwarp.fit.views import to_float
@@ -36,17 +36,11 @@ HOW = "--at X,Y, --box X0,Y0,X1,Y1, --mask FILE or --where WORDS"
 POOR = 0.8
 """Overlap of a mask with its lifted mask below which the splats do not follow the mask."""
 
-KEPT = 0.1
-"""Share of the middle of a mark that the lifted mask must keep."""
-
 HARDLY = 0.5
 """Share of the source view from which on a click marks hardly one thing."""
 
 MARKED = "marked.png"
 """File of an edit's folder: its source view with the mark, unlit outside the mask."""
-
-CLICKED = 2.0
-"""Radius of the middle of a click, px."""
 
 
 @dataclass(frozen=True)
@@ -301,36 +295,6 @@ def lifted_segments(
     # The soft edge lies inside, so that pixels marked less than half do not change.
     soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in views.cameras)
     return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
-
-
-def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> None:
-    """Refuse a lifted mask that leaves out the middle of the object marked in the source.
-
-    Args:
-        mask: (H, W) mask of the marked source view.
-        scale: px of the view per px of its file, the unit of the marks.
-        lifted: (H, W) lifted mask of the source view, in [0, 1].
-    """
-    import cv2
-
-    h, w = mask.shape
-    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    if marks.box is not None:
-        x0, y0, x1, y1 = (scale * v for v in marks.box)
-        limit, away = CORE, np.hypot((2 * x - x0 - x1) / (x1 - x0), (2 * y - y0 - y1) / (y1 - y0))
-    elif marks.at is not None:
-        away = np.min([np.hypot(x - scale * u, y - scale * v) for u, v in pairs(marks.at)], axis=0)
-        limit = CLICKED
-    else:
-        inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        limit, away = 0.5, 1 - inward / inward.max()
-    share = (lifted[away <= max(limit, away.min())] > 0.5).mean()
-    if share < KEPT:
-        raise InputError(
-            f"{marks.option}: lifted through the splats, what it marks leaves {1 - share:.0%} of"
-            " its own middle out, so other things would be edited; mark the thing in another way,"
-            f" by {HOW}, or in another --source"
-        )
 
 
 def read_mask(
