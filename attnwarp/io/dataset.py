@@ -45,8 +45,6 @@ class Dataset:
         splits: splits, one for each camera: "train", "val", "test", or None if the file names none.
         lenses: lenses, one for each camera; None for a pinhole. Every camera is used as a pinhole:
             pictures of another lens must be undistorted first, see :func:`undistort`.
-        applied_transform: (3, 4) transform from the original world to that of the cameras and
-            points, as stated in a transforms.json. For information only.
         mask_paths: pictures, one for each camera, whose dark pixels (below half of white) say
             which pixels of the image to ignore; None without one.
 
@@ -69,7 +67,6 @@ class Dataset:
     points: Array | None = None
     colors: npt.NDArray[np.uint8] | None = None
     splits: list[str | None] = field(default_factory=list)
-    applied_transform: Array | None = None
     lenses: list[Lens | None] = field(default_factory=list)
     mask_paths: list[Path | None] = field(default_factory=list)
 
@@ -94,10 +91,6 @@ class Dataset:
             check.shape(self.colors, (len(self.points), 3), "colors")
             if self.colors.dtype != np.uint8:
                 raise ValueError(f"colors: got {self.colors.dtype}, expected uint8")
-        if self.applied_transform is not None:
-            self.applied_transform = np.asarray(self.applied_transform, dtype=np.float64)
-            check.shape(self.applied_transform, (3, 4), "applied_transform")
-            check.finite(self.applied_transform, "applied_transform")
 
     def __len__(self) -> int:
         return len(self.cameras)

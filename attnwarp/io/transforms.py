@@ -2,8 +2,8 @@
 
 ``transform_matrix`` is camera-to-world in OpenGL axes (x right, y up, z backward). Pixel centres
 lie at +0.5 as here, so ``cx = w / 2`` is the middle of the image. Cameras and points stay in the
-world of the file: ``applied_transform`` is returned as information, and instant-ngp's ``scale``,
-``offset`` and ``aabb_scale`` (the scene's fit into its unit cube) are not applied.
+world of the file: nerfstudio's ``applied_transform`` and instant-ngp's ``scale``, ``offset`` and
+``aabb_scale`` (the scene's fit into its unit cube) are not read.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def read_transforms(
     each: dict[str, Any] = {
         name: [value for part in parts for value in getattr(part, name)] for name in OF_IMAGES
     }
-    return replace(with_points, applied_transform=parts[0].applied_transform, **each)
+    return replace(with_points, **each)
 
 
 def write_transforms(
@@ -214,8 +214,6 @@ def write_transforms(
         data |= {"camera_angle_x": 2 * math.atan(shared["w"] / (2 * shared["fl_x"])), **shared}
     else:
         frames = [frame | each for frame, each in zip(frames, intrinsics, strict=True)]
-    if dataset.applied_transform is not None:
-        data["applied_transform"] = dataset.applied_transform.tolist()
     members = {
         split: [name for name, its in zip(names, dataset.splits, strict=True) if its == split]
         for split in SPLITS
@@ -334,10 +332,7 @@ def _read_file(
                 path, f"{cloud} is missing; put it there or remove the key", field="ply_file_path"
             )
         points, colors = read_points(cloud)
-    applied = None
-    if "applied_transform" in data:
-        applied = _matrix(path, "applied_transform", None, data["applied_transform"])[:3]
-    return Dataset(cameras, available, points, colors, splits, applied, lenses, masks)
+    return Dataset(cameras, available, points, colors, splits, lenses, masks)
 
 
 def _mask(values: _Values) -> Path | None:
@@ -581,7 +576,7 @@ def _camera(values: _Values, image: Path) -> Camera:
         raise values.refuse("transform_matrix", str(error)) from None
 
 
-def _matrix(path: Path, key: str, row: int | None, value: Any) -> Array:
+def _matrix(path: Path, key: str, row: int, value: Any) -> Array:
     """Parse a finite (4, 4) or (3, 4) matrix; a last row must be [0, 0, 0, 1]."""
     try:
         matrix = np.array(value, dtype=np.float64)

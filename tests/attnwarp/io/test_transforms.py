@@ -200,7 +200,6 @@ def test_a_pose_that_is_not_rigid_is_refused_with_frame_and_size_of_the_error(
         ({"camera_angle_x": 4.0, "fl_x": None}, ["camera_angle_x", "radians"]),
         ({"fl_x": None, "fl_y": None}, ["fl_x", "camera_angle_x"]),
         ({"ply_file_path": "none.ply"}, ["ply_file_path", "none.ply is missing"]),
-        ({"applied_transform": [[1, 0], [0, 1]]}, ["applied_transform", "4 x 4"]),
         ({"train_filenames": "images/000.png"}, ["train_filenames", "list"]),
     ],
 )
@@ -303,7 +302,6 @@ def dataset_of(tmp_path, focal=(9.0, 9.0)):
 def test_what_is_written_is_read_back(tmp_path, focal):
     data = dataset_of(tmp_path, focal)
     data.splits = ["train", "test"]
-    data.applied_transform = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
     write_transforms(tmp_path, data)
     back = read_dataset(tmp_path)
     for a, b in zip(data.cameras, back.cameras, strict=True):
@@ -313,7 +311,6 @@ def test_what_is_written_is_read_back(tmp_path, focal):
         assert (a.width, a.height) == (b.width, b.height)
     assert back.image_paths == data.image_paths and back.splits == data.splits
     assert np.array_equal(back.points, data.points) and np.array_equal(back.colors, data.colors)
-    assert np.array_equal(back.applied_transform, data.applied_transform)
     assert not list(tmp_path.glob(".*"))
 
 
