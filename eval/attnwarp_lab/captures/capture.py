@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from attnwarp.camera import Camera
 from attnwarp.cli.files import check_seen, likeness
 from attnwarp.command.edit import marked, view_of
 from attnwarp.command.marks import Marks
@@ -43,11 +42,6 @@ class Ready:
     source: int
     content: str
 
-    @property
-    def cameras(self) -> list[Camera]:
-        """Cameras of the views."""
-        return list(self.views.cameras)
-
 
 def ready(loaded: Loaded, name: str) -> Ready:
     """Read a capture; each process caches the last one.
@@ -81,7 +75,7 @@ def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) ->
     Raises:
         InputError: the PSNR is below :data:`LEAST_PSNR`; the message begins with ``place``.
     """
-    check_seen(path, splats, capture.cameras, SILENT)
+    check_seen(path, splats, capture.views.cameras, SILENT)
     psnr, _ = likeness(splats, capture.dataset)
     if psnr < LEAST_PSNR:
         raise InputError(

@@ -183,7 +183,7 @@ class Run:
                 segments(self.loaded, name, self.root, self.device, self.report)
                 marks = marks_of(self.loaded, name)
                 files = [marks.mask] if marks.mask else []
-                files += mask_files(marks.masks, capture.cameras) if marks.masks else []
+                files += mask_files(marks.masks, capture.views.cameras) if marks.masks else []
                 mask = digest(part.mask.model_dump(mode="json"), *(p.read_bytes() for p in files))
         return {"capture": capture.content, "splats": splats, "mask": mask}
 
@@ -229,8 +229,8 @@ class Run:
         result = self._edited(cell, before, folder / "run", budget, report)
         originals = self.root / ORIGINALS / cell.scene
         images = [capture.views.picture(k) for k in range(len(capture.views))]
-        near = near_of(capture.cameras, before)
-        for k, camera in enumerate(capture.cameras):
+        near = near_of(capture.views.cameras, before)
+        for k, camera in enumerate(capture.views.cameras):
             _write(originals, k, images[k])
             _write(folder / "renders", k, render_picture(result.gaussians, camera, near, "auto"))
         for k, pixels in result.edited.items():
@@ -267,7 +267,7 @@ class Run:
             ready(self.loaded, cell.scene),
             FitSettings.from_dict(cell.spec["splats"]),
         )
-        start = first_splats(capture.dataset, capture.cameras, settings, report)
+        start = first_splats(capture.dataset, capture.views.cameras, settings, report)
         start = start.to(device=self.device)
         if first:
             return start
@@ -295,9 +295,9 @@ class Run:
         compile_kernels(splats.kind, report, self.device)
         marked = segments(self.loaded, cell.scene, self.root, self.device, SILENT)
         job = editing_methods.Job(
-            splats, capture.cameras, capture.views.images, editor, spec["text"], spec["settings"],
-            folder, None, {}, budget, segments=marked(splats), source=capture.source,
-            masks=capture.views.masks, report=report, load=encoder_of,
+            splats, capture.views.cameras, capture.views.images, editor, spec["text"],
+            spec["settings"], folder, None, {}, budget, segments=marked(splats),
+            source=capture.source, masks=capture.views.masks, report=report, load=encoder_of,
         )  # fmt: skip
         return EDITING_METHODS[spec["method"]].run(job)
 

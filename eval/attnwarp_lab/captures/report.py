@@ -50,7 +50,7 @@ def results_json(run: Run, records: Records) -> Json:
         "captures": {
             name: {
                 "sha256": ready(run.loaded, name).content,
-                "views": [camera.name for camera in ready(run.loaded, name).cameras],
+                "views": [camera.name for camera in ready(run.loaded, name).views.cameras],
                 "originals": f"{ORIGINALS}/{name}",
                 "edits": {title: edit.instruction for title, edit in part.edits.items()},
             }
@@ -151,7 +151,7 @@ def _pictures(run: Run, records: Records) -> Section:
     edits = [*run.loaded.edits()]
     grids, pages = [], []
     for scene, title in edits:
-        names = [camera.name for camera in ready(run.loaded, scene).cameras]
+        names = [camera.name for camera in ready(run.loaded, scene).views.cameras]
         count = min(max(1, PICTURED // len(edits)), len(names))
         views = [k * len(names) // count for k in range(count)]
         folders: dict[str, str] = {"before": f"{ORIGINALS}/{scene}"}

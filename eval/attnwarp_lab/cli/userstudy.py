@@ -77,17 +77,14 @@ def score(
     ],
     out: Annotated[
         Path | None,
-        option("Write preferences.json, .md and .html to this folder.", "FOLDER"),
+        option("Write preferences.md and .html to this folder.", "FOLDER"),
     ] = None,
 ) -> None:
     """Score each method by its selections, with intervals, and name who failed attention checks."""
-    import json
-
     from rich.console import Console
 
     from attnwarp.cli.shell import check_out
     from attnwarp_eval.document import write
-    from attnwarp_eval.files import write_atomic
     from attnwarp_lab.userstudy.answers import read_answers
     from attnwarp_lab.userstudy.score import report, score
 
@@ -110,10 +107,5 @@ def score(
         for note in notes:
             typer.echo(note, err=True)
         if out is not None:
-            data = json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
-            write_atomic(out / "preferences.json", data.encode())
-            for path in (
-                out / "preferences.json",
-                *write.write_files(document, out, "preferences"),
-            ):
+            for path in write.write_files(document, out, "preferences"):
                 typer.echo(path)

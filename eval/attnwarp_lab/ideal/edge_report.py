@@ -16,7 +16,7 @@ from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import ByView, over_scenes
 from attnwarp_eval.study.probe_report import Layout
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.ideal.edges import AT, AWAY, FAR, OFF, PLACES, edges_of
+from attnwarp_lab.ideal.edges import AT, AWAY, FAR, OFF, PLACES
 
 Figures = tuple[str, str, str]
 """Variant of a row, its metrics of what is right and of what hidden tokens take; {} is a place."""
@@ -61,7 +61,7 @@ TEXT = (
     " does not show that takes something of it all the same. The difference is over views that"
     " have both, with the 95 % interval over scenes; it is described, not judged. A token at an"
     " edge shows two surfaces, so exact geometry and mask lose there too: hold each row's"
-    " difference against theirs, and against that of views alone, which carry nothing."
+    " difference against theirs."
 )
 
 
@@ -70,16 +70,14 @@ def edge_section(
     layout: Layout,
     probe: str,
     metrics: Mapping[str, Figures],
-) -> Section | None:
-    """Section on depth edges: one figure and one table; None if not asked for.
+) -> Section:
+    """Section on depth edges: one figure and one table.
 
     Args:
         results, layout: run and layout of the report.
         probe: name of the probe.
         metrics: figures by row.
     """
-    if edges_of(results.study, probe) is None or not results.finished(probe):
-        return None
     path, distances = layout.figure(f"edges-{probe}.svg"), range(FAR + 1)
     near = [
         charts.Line(

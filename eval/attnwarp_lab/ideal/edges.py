@@ -25,14 +25,12 @@ AT, OFF = PLACES[0], "away"
 class Edges(Part):
     """Variants whose errors at depth edges are judged.
 
-    ``exact``: exact geometry and mask. ``alone``: views alone; nothing is right without it.
-    ``control``: features from a wrong place. ``methods``: the judged ones. ``parts``: of labels, by
-    default the first number of the study; small ones, as a part as large as several tokens hides
-    errors of one.
+    ``exact``: exact geometry and mask. ``control``: features from a wrong place. ``methods``: the
+    judged ones. ``parts``: by default the first number of the study; small ones, as a part as large
+    as several tokens hides errors of one.
     """
 
     exact: str
-    alone: str = ""
     control: str = ""
     methods: list[str] = Field(min_length=1)
     parts: Annotated[Whole | None, Field(ge=2, le=10_000)] = None
@@ -40,8 +38,7 @@ class Edges(Part):
     @property
     def named(self) -> list[str]:
         """All variants, the methods first."""
-        others = (self.exact, self.alone, self.control)
-        return [*self.methods, *(name for name in others if name)]
+        return [*self.methods, *(name for name in (self.exact, self.control) if name)]
 
 
 class EdgesPart(Part):

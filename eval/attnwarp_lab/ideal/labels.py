@@ -7,13 +7,14 @@ docs/measuring/ideal-editor.md describes what the figures can and cannot decide.
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
+from attnwarp.warp import FeatureWarp
 from attnwarp_eval.metrics.arrays import share
 
 Labels = npt.NDArray[np.int16]
@@ -33,20 +34,7 @@ FEWEST = 20
 """Visible tokens below which a view has no net share: one token would move it by over 5 points."""
 
 
-class Layer(Protocol):
-    """The warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
-
-    @property
-    def mask(self) -> Any:
-        """(h, w) bool, where features are taken."""
-        ...
-
-    def warp(self, features: npt.NDArray[Any]) -> Any:
-        """(C, h, w) of the source's (C, h', w')."""
-        ...
-
-
-def carried_labels(layer: Layer, source: Labels) -> Labels:
+def carried_labels(layer: FeatureWarp, source: Labels) -> Labels:
     """(h, w) label that each token of a target takes: that of the heaviest tap.
 
     Args:
@@ -86,54 +74,6 @@ def most(pixels: Mask, size: tuple[int, int]) -> Mask:
     (H, W), (h, w) = pixels.shape, size
     cells = pixels.reshape(h, H // h, w, W // w).sum(axis=(1, 3))
     return np.asarray(2 * cells > (H // h) * (W // w))
-
-
-def label_tokens(
-    carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
-) -> dict[str, Mask]:
-    """Tokens of each kind that :func:`label_transport` counts.
-
-    Args:
-        carried, tokens, pixels, visible, unseen: as for :func:`label_transport`.
-
-    Returns:
-        (h, w) bool: "right", "wrong" and "none" partition "visible"; "painted_hidden" is part of
-        "hidden", "painted_outside" part of "outside".
-
-    Raises:
-        ValueError: incompatible shapes.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_lab.ideal.labels import label_transport
-        >>> parts, everywhere = np.array([[0, 1]]), np.ones((1, 2), dtype=bool)
-        >>> kinds = label_tokens(np.array([[0, 0]]), parts, parts, everywhere, ~everywhere)
-        >>> kinds["right"].tolist(), kinds["wrong"].tolist()
-        ([[True, False]], [[False, True]])
-    """
-    h, w = tokens.shape
-    H, W = pixels.shape
-    check.shape(carried, (h, w), "carried")
-    for name, array in (("visible", visible), ("unseen", unseen)):
-        check.shape(array, (H, W), name)
-    if H % h or W % w:
-        raise ValueError(f"tokens: got {h} x {w} for {H} x {W} px, expected divisors of them")
-    own = pixels == np.repeat(np.repeat(tokens, H // h, axis=0), W // w, axis=1)
-    thing = tokens >= 0
-    seen = thing & most(own & visible, (h, w))
-    hidden = thing & most(own & unseen, (h, w))
-    painted = carried >= 0
-    right, none = carried == tokens, carried == NONE
-    return {
-        "visible": seen,
-        "hidden": hidden,
-        "outside": ~thing,
-        "right": seen & right,
-        "wrong": seen & ~right & ~none,
-        "none": seen & none,
-        "painted_hidden": hidden & painted,
-        "painted_outside": ~thing & painted,
-    }
 
 
 def depth_edges(depth: npt.NDArray[Any]) -> Mask:
@@ -237,7 +177,28 @@ def label_transport(
         >>> label_transport(carried, true, true, seen, ~seen)["labels.net"]
         0.5
     """
-    kinds = label_tokens(carried, tokens, pixels, visible, unseen)
+    h, w = tokens.shape
+    H, W = pixels.shape
+    check.shape(carried, (h, w), "carried")
+    for name, array in (("visible", visible), ("unseen", unseen)):
+        check.shape(array, (H, W), name)
+    if H % h or W % w:
+        raise ValueError(f"tokens: got {h} x {w} for {H} x {W} px, expected divisors of them")
+    own = pixels == np.repeat(np.repeat(tokens, H // h, axis=0), W // w, axis=1)
+    thing = tokens >= 0
+    seen = thing & most(own & visible, (h, w))
+    hidden = thing & most(own & unseen, (h, w))
+    takes, right, none = carried >= 0, carried == tokens, carried == NONE
+    kinds = {
+        "visible": seen,
+        "hidden": hidden,
+        "outside": ~thing,
+        "right": seen & right,
+        "wrong": seen & ~right & ~none,
+        "none": seen & none,
+        "painted_hidden": hidden & takes,
+        "painted_outside": ~thing & takes,
+    }
     counts = {
         name: int((kind if among is None else kind & among).sum()) for name, kind in kinds.items()
     }

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.colors import color_difference
-from attnwarp_eval.metrics.arrays import mean, share
+from attnwarp_eval.metrics.arrays import share
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import EditSpec
 from attnwarp_eval.truth import Geometry, two_view
@@ -200,7 +200,7 @@ def depth_figures(
     Returns:
         ``shape.stands``: share of the pixels whose depth is within :data:`STANDS` of the truth
         after the edit, undefined ones not; by kind for surface that is new and where one is gone,
-        and for untouched surface; ``shape.depth``: mean relative error where defined, of all kinds.
+        and for untouched surface.
     """
     error = np.abs(depth - view.depth) / view.depth
     error[~np.isfinite(view.depth)] = np.nan
@@ -214,9 +214,4 @@ def depth_figures(
     return {
         **counts.shares(),
         "shape.stands.untouched": share(int(stands[own].sum()), int(own.sum())),
-        "shape.depth.untouched": mean(error[own & np.isfinite(error)]),
-        **{
-            f"shape.depth.{region}": mean(error[where & np.isfinite(error)])
-            for region, where in (("new", view.new.any(axis=0)), ("gone", view.gone.any(axis=0)))
-        },
     }

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.numbers import bracketed
 from attnwarp_eval.statistics.intervals import Interval, interval
@@ -32,22 +30,6 @@ class Score:
     counted: Sequence[Person]
     failed: Sequence[str]
     frequency: Mapping[str, Mapping[str, Interval]]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; null where undefined."""
-        questions = {
-            question: {
-                method: {
-                    "frequency": share.mean, "low": share.low, "high": share.high,
-                    "shown": share.views, "people": share.scenes,
-                }
-                for method, share in methods.items()
-            }
-            for question, methods in self.frequency.items()
-        }  # fmt: skip
-        people = {person.name: len(person.choices) for person in self.counted}
-        plain = {"title": self.title, "failed": list(self.failed), "choices": people}
-        return dict(without_nan({**plain, "questions": questions}))
 
 
 def score(people: Sequence[Person]) -> Score:

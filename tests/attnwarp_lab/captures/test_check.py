@@ -147,5 +147,5 @@ def test_smaller_copies_of_the_pictures_are_read_by_the_scale_of_a_capture(made,
         Image.open(file).resize((16, 16)).save(folder / "captures/one/images_2" / file.name)
     manifest["captures"]["one"]["scale"] = 2
     loaded = load_manifest(str(save(folder, manifest)))
-    sizes = [{c.width for c in ready(loaded, name).cameras} for name in ("one", "two")]
+    sizes = [{c.width for c in ready(loaded, name).views.cameras} for name in ("one", "two")]
     assert sizes == [{16}, {32}]

@@ -9,7 +9,9 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
+from attnwarp_lab.userstudy.answers import read_answers
 from attnwarp_lab.userstudy.draw import SCRAMBLED
+from attnwarp_lab.userstudy.score import score as scored
 
 
 def choice(question, left, right, chosen, **changes):
@@ -44,14 +46,14 @@ def test_selection_frequency_is_the_mean_of_peoples_shares_with_students_interva
     paths = [answers(tmp_path, "one", one), answers(tmp_path, "two", two)]
     done = score(*paths, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
-    questions = json.loads((tmp_path / "out" / "preferences.json").read_text())["questions"]
-    warped = questions["overall"]["warped"]  # 3 of 4, and 0 of 2
+    result = scored(read_answers(paths)[0]).frequency
+    warped = result["overall"]["warped"]  # 3 of 4, and 0 of 2
     shares = [3 / 4, 0]
     low, high = stats.t.interval(0.95, 1, np.mean(shares), stats.sem(shares))
-    assert warped == {"frequency": pytest.approx(3 / 8), "low": pytest.approx(low),
-                      "high": pytest.approx(high), "shown": 6, "people": 2}  # fmt: skip
-    assert questions["quality"]["warped"]["frequency"] == pytest.approx((2 / 3 + 0) / 2)
-    assert questions["consistency"]["alone"]["frequency"] is None  # never shown
+    assert [warped.mean, warped.low, warped.high] == pytest.approx([3 / 8, low, high])
+    assert (warped.views, warped.scenes) == (6, 2)  # times it was shown, and people
+    assert result["quality"]["warped"].mean == pytest.approx((2 / 3 + 0) / 2)
+    assert np.isnan(result["consistency"]["alone"].mean)  # never shown
     text = (tmp_path / "out" / "preferences.md").read_text()
     (row,) = re.findall(r"^\| alone +\|.*$", text, re.MULTILINE)
     assert [cell.strip() for cell in row.strip("|").split("|")][2] == "–"
@@ -66,13 +68,12 @@ def test_who_chose_a_scrambled_side_is_named_and_does_not_count(tmp_path):
         answers(tmp_path, "p2", good),
         answers(tmp_path, "asleep", bad),
     ]
-    done = score(*paths, "--out", tmp_path)
+    done = score(*paths)
     assert done.exit_code == 0
     assert "failed an attention check: asleep." in done.stdout
-    result = json.loads((tmp_path / "preferences.json").read_text())
-    assert result["failed"] == ["asleep"]
-    assert result["questions"]["quality"]["a"]["frequency"] == 1
-    assert result["choices"] == {"p1": 1, "p2": 1}
+    result = scored(read_answers(paths)[0])
+    assert result.frequency["quality"]["a"].mean == 1
+    assert [person.name for person in result.counted] == ["p1", "p2"]
     done = score(paths[2])
     assert done.exit_code == 3 and "no choices of people who passed" in done.stderr
 
@@ -82,10 +83,9 @@ def test_a_person_who_saved_twice_counts_once(tmp_path):
     early = answers(tmp_path, "early", made[:1], person="p")
     late = answers(tmp_path, "late", made, person="p")
     other = answers(tmp_path, "other", made)
-    done = score(early, late, other, "--out", tmp_path)
+    done = score(early, late, other)
     assert f"{early}: left out, as {late} has the same person's answers" in done.stderr
-    result = json.loads((tmp_path / "preferences.json").read_text())
-    assert result["choices"] == {"p": 2, "other": 2}
+    assert "2 people made 4 choices between 2 methods" in done.stdout
 
 
 @pytest.mark.parametrize(

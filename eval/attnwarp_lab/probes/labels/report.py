@@ -1,8 +1,8 @@
-"""Report of labels: right, wrong, none, painted by grid, parts, and distance to depth edges."""
+"""Report of labels: right, wrong, none, painted, and by distance to depth edges."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
 from attnwarp_eval.document.model import Section, Table
@@ -55,29 +55,6 @@ class LabelReport(ProbeReport):
         if any("labels.net" in view.metrics for record in records for view in record.views):
             yield Section("Tokens", [TOKENS], [Table(["variant", *self.columns], rows)])
         edges = edges_of(results.study, self.name)
-        if edges is None:
-            return
-        metrics = {name: (name, RIGHT, HIDDEN) for name in edges.named}
-        section = edge_section(results, layout, self.name, metrics)
-        if section is not None:
-            yield section
-
-    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Right labels by grid and number of parts."""
-        specs = [record.spec for _, record in results.finished(self.name)]
-        if not specs:
-            return []
-        grids = specs[0]["grids"]
-        rows = [
-            [
-                name,
-                str(count),
-                *mean_values(
-                    results, self.name, name, [f"labels.right.{grid}.{count}" for grid in grids]
-                ),
-            ]
-            for name in names
-            for count in specs[0]["parts"]
-        ]
-        caption = "Right labels by tokens along a side"
-        return [Table(["variant", "parts", *map(str, grids)], rows, caption)]
+        if edges is not None and names:
+            metrics = {name: (name, RIGHT, HIDDEN) for name in edges.named}
+            yield edge_section(results, layout, self.name, metrics)
