@@ -126,14 +126,16 @@ def table(claims: list[Judged], beside: Path) -> Table:
 
 
 def headlines(claims: list[Judged]) -> list[str]:
-    """Lines of the claims that README.md names, in their order; none if none was judged."""
+    """Lines of the claims that README.md names, in their order, those of one number in one line;
+    none if none was judged.
+    """
     chosen = sorted(
         (each for each in claims if each.claim.headline), key=lambda each: each.claim.headline
     )
-    lines = []
-    for number, each in enumerate((e for e in chosen if e.comparison is not None), 1):
-        one = each.comparison
-        assert one is not None
+    lines: dict[int, list[str]] = {}
+    for each in chosen:
+        if (one := each.comparison) is None:
+            continue
         verdict, why = claim_verdict(one), one.reason
         if verdict == "blind":
             why = "features from a wrong place do as well"
@@ -141,8 +143,8 @@ def headlines(claims: list[Judged]) -> list[str]:
         text = each.claim.plain or each.claim.text
         difference = f"{_plainly(one)}, over {one.contrast.scenes} scenes"
         told = f"{verdict[0].upper()}{verdict[1:]}{reason}: {difference}."
-        lines.append(f"{number}. **{text}.** {told}")
-    return lines
+        lines.setdefault(each.claim.headline, []).append(f"**{text}.** {told}")
+    return [f"{number}. {' '.join(told)}" for number, told in enumerate(lines.values(), 1)]
 
 
 def _plainly(one: Comparison) -> str:

@@ -176,6 +176,9 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     (line,) = headlines(claims)
     # With factors from 1.6 to 3.3 the mean of the logarithms is 0.85.
     assert line.endswith("Holds: 2.3 times the error, over 8 scenes.")
+    priced = dataclasses.replace(slip.claim, plain="The price")
+    price = dataclasses.replace(slip, claim=priced)
+    assert headlines([slip, price]) == [f"{line} **The price.** {line.partition('.** ')[2]}"]
     document = tmp_path / "README.md"
     document.write_text("a\n<!-- verdicts -->\nold\n<!-- /verdicts -->\nb\n")
     assert invoke("verdicts", reports, "--write", document).exit_code == 0
