@@ -17,10 +17,8 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import compare, read_baseline, read_snapshot
 from attnwarp_eval.compare.pictures import pictures_of_baseline
 from attnwarp_eval.compare.snapshot import definition
-from attnwarp_eval.cost import Meter
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.probes.depth import measure as depth
-from attnwarp_eval.study.probes.warp import measure as warp
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.shared import warps
 
@@ -89,24 +87,6 @@ def a_mask_rule_lost(patch):
     patch.setattr(warps, "warp_view", lax)
 
 
-def a_dropped_metric(patch):
-    def fewer(*arguments):
-        figures = warp_figures(*arguments)
-        del figures["warp.epe_median"]
-        return figures
-
-    warp_figures = warp.warp_figures
-    patch.setattr(warp, "warp_figures", fewer)
-
-
-def a_doubled_counter(patch):
-    def doubled(self, **counts):
-        count(self, **{name: 2 * n if name == "taps" else n for name, n in counts.items()})
-
-    count = Meter.count
-    patch.setattr(Meter, "count", doubled)
-
-
 def a_repeated_edit(patch):
     def twice(*arguments):
         edit_targets(*arguments)
@@ -121,25 +101,12 @@ def each_step_rendered_twice(patch):
         patch.setattr(module, "render", lambda *a, **k: (render(*a, **k), render(*a, **k))[0])
 
 
-def a_dropped_cell(patch):
-    def fails(self, work):
-        if work.cell.variant == "released":
-            raise MemoryError("planted")
-        return compute(self, work)
-
-    compute = warp.Warp.compute
-    patch.setattr(warp.Warp, "compute", fails)
-
-
 FOUND = {
     half_a_pixel: ("worse", "warp / corrected / warp.epe_median"),
     one_percent_in_depth: ("worse", "depth / corrected / depth.abs_rel"),
     a_mask_rule_lost: ("worse", "warp / corrected / occlusion.precision"),
-    a_dropped_metric: ("missing", "spheres / warp / corrected / seed 0 / warp.epe_median"),
-    a_doubled_counter: ("counter", "spheres / warp / corrected / seed 0 / taps"),
     a_repeated_edit: ("counter", "spheres / ideal / corrected / seed 0 / network_rows"),
     each_step_rendered_twice: ("counter", "spheres / ideal / corrected / seed 0 / rendered_pairs"),
-    a_dropped_cell: ("missing", "spheres / warp / released / seed 0"),
 }
 
 

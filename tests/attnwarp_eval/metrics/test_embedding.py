@@ -14,7 +14,6 @@ from attnwarp_eval.metrics import (
     match_similarity,
 )
 from attnwarp_eval.metrics.embedding import TINY_DISPLACEMENT, TINY_NORM
-from attnwarp_eval.metrics.registry import METRICS
 
 E = np.eye(4)
 
@@ -140,16 +139,6 @@ def test_no_views_give_no_value():
     assert (
         isinstance(result, Similarity) and result.values.shape == (0,) and math.isnan(result.mean)
     )
-
-
-def test_the_figures_are_specified():
-    for name in ("clip_similarity", "clip_directional", "clip_image", "dino_image"):
-        assert (
-            METRICS[f"embedding.{name}"].direction == "higher"
-            and METRICS[f"embedding.{name}"].unit == "cosine"
-        )
-    assert METRICS["embedding.undefined"].direction == "lower"
-    assert METRICS["perceptual.distance"].direction == "lower"
 
 
 def test_changes_of_neighbouring_views_by_brute_force_and_one_undefined():

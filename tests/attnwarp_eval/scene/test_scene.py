@@ -1,6 +1,4 @@
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -332,17 +330,6 @@ def test_the_content_hash_tells_scenes_apart_and_nothing_else(tmp_path):
         another_camera.content_hash != scene.content_hash
         and another_camera.world_hash == scene.world_hash
     )
-
-
-@pytest.mark.door  # ids of cells, which have it in them, are those of the gate's baseline
-def test_the_content_hash_is_another_processes(tmp_path):
-    path = write(tmp_path, SMALL)
-    code = (
-        "from attnwarp_eval.scene.file import load_scene;"
-        f" print(load_scene({str(path)!r}).content_hash)"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == load_scene(path).content_hash
 
 
 def test_a_scene_travels_through_pickle(tmp_path):

@@ -163,28 +163,6 @@ def test_an_export_that_stops_half_way_leaves_no_cameras_of_the_one_before(
         read_dataset(tmp_path)
 
 
-def test_errors_of_a_picture_are_those_of_scikit_image():
-    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
-
-    random = np.random.default_rng(0)
-    truth = random.integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    image = np.clip(truth / 255 + random.normal(0, 0.1, truth.shape), 0, 1)
-    result = fitted.picture_error(image, truth)
-    assert result["fit.psnr"] == pytest.approx(
-        peak_signal_noise_ratio(truth / 255, image, data_range=1), abs=1e-9
-    )
-    expected = structural_similarity(
-        truth / 255,
-        image,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        channel_axis=-1,
-        data_range=1,
-    )
-    assert result["fit.ssim"] == pytest.approx(expected, abs=1e-9)
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, coarse_textures):
     folder = tmp_path_factory.mktemp("fits")
