@@ -18,8 +18,7 @@ from attnwarp_eval.effects import detect, proof, saving
 from attnwarp_eval.scene import transport
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.scene.spec import SceneSpec
+from attnwarp_eval.scene.scene import SceneError
 from attnwarp_eval.truth import Geometry, mitsuba
 from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.passes import Pass, Plan, beam
@@ -590,11 +589,3 @@ def test_file_and_loaded_scene_agree_on_every_scene_that_ships():
 
     for name in list_scenes():
         detect.detect(load_scene(name))
-
-
-def test_a_scene_made_in_code_is_checked_too():
-    spec = SceneSpec.model_validate(
-        make([FLOOR], [SKY]).spec.model_dump(mode="json") | {"effects": {"forbid": ["environment"]}}
-    )
-    with pytest.raises(SceneError, match="'environment' is forbidden"):
-        plan(Scene(spec))

@@ -9,7 +9,7 @@ from attnwarp.camera import Camera
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
 from attnwarp_eval.scene.solids import Capsule, Ellipsoid, mesh_body
-from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Geometry, edge_band, two_view
+from attnwarp_eval.truth import AMBIGUOUS, NONE, VISIBLE, Geometry, edge_band, two_view
 
 GROUND = Rectangle(np.zeros(3), np.array([4.0, 0, 0]), np.array([0, 4.0, 0]), object_id=0)
 
@@ -185,13 +185,6 @@ def test_what_lies_behind_the_source_camera_is_outside_and_not_visible():
     assert not pair.visible[pair.behind].any()
     certain = pair.behind & (pair.label != AMBIGUOUS)
     assert pair.outside[certain].all() and pair.unseen[certain].all()
-
-
-def test_the_back_of_a_card_is_hidden_from_the_view_of_its_front():
-    card = Rectangle(np.array([0, 0, 0.5]), np.array([0, 1.0, 0]), np.array([0, 0, 0.5]))
-    pair = two_view(Geometry([card]), camera(0), camera(180))
-    inside = pair.hits.valid & (pair.label != AMBIGUOUS)
-    assert inside.sum() > 50 and (pair.label[inside] == HIDDEN).all()
 
 
 def test_surfaces_seen_edge_on_are_ambiguous():

@@ -175,15 +175,6 @@ def test_few_samples_of_fog_have_the_mean_of_many():
     assert mean(4, 24) == pytest.approx(mean(64, 3), rel=8e-3)
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_seed_other_noise(monkeypatch, tmp_path):
-    scene = load_scene("spheres").with_size(32, 32)
-    planned = plan(scene, 2)
-    first = mitsuba.render_plan(scene, scene.source, planned, 5)
-    assert first.dtype == np.float32 and np.isfinite(first).all()
-    assert np.array_equal(first, mitsuba.render_plan(scene, scene.source, planned, 5))
-    assert not np.array_equal(first, mitsuba.render_plan(scene, scene.source, planned, 6))
-
-
 def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     scene = world([SUN, SKY], spp=1).with_size(16, 16)
