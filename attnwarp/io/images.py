@@ -227,8 +227,10 @@ def _pixels(image: Any) -> npt.NDArray[np.uint8] | None:
     """
     deep = image.mode in ("I", "F") or ";16" in str(image.tile)
     image.load()
-    clear = image.mode.endswith("A") or "transparency" in image.info
-    return None if deep else np.array(image.convert("RGBA" if clear else "RGB"))
+    mode = "RGBA" if image.mode.endswith("A") or "transparency" in image.info else "RGB"
+    if deep:
+        return None
+    return np.array(image if image.mode == mode else image.convert(mode))
 
 
 def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
