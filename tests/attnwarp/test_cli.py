@@ -396,17 +396,6 @@ def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_pat
     assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["5.png"]
 
 
-def test_the_number_of_threads_changes_no_bit(data, tmp_path):
-    for count in (1, 3):
-        done = in_process(
-            "fit", data, "--out", tmp_path / str(count), "--iterations", 20, "--threads", count
-        )
-        assert done.exit_code == 0, done.stderr
-    assert (tmp_path / "1" / "splats.ply").read_bytes() == (
-        tmp_path / "3" / "splats.ply"
-    ).read_bytes()
-
-
 def start_and_wait_for_a_checkpoint(arguments, out):
     process = subprocess.Popen(
         [*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE

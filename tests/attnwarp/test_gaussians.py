@@ -63,15 +63,6 @@ def test_quaternions_of_ordinary_length_turn_with_the_bits_of_the_plain_formula(
         assert torch.equal(got, expected)
 
 
-def test_the_normal_is_the_third_axis_of_a_disc_and_the_shortest_of_an_ellipsoid():
-    disc = splats("2d", dtype=torch.float64)
-    assert torch.equal(disc.normals(), disc.rotations()[:, :, 2])
-    scales = torch.tensor([[0.1, 2, 3], [2, 0.1, 3], [3, 2, 0.1]], dtype=torch.float64)
-    ball = splats("3d", n=3, dtype=torch.float64, scales=scales)
-    expected = torch.stack([ball.rotations()[i, :, i] for i in range(3)])
-    assert torch.equal(ball.normals(), expected)
-
-
 def test_selecting_keeps_rows_together_and_everything_else():
     model = splats(origin=[1.0, 2, 3])
     chosen = model.select(torch.tensor([3, 1]))

@@ -29,21 +29,6 @@ def test_a_line_tells_the_time_left_and_the_last_one_has_none(clock):
     ]
 
 
-@pytest.mark.parametrize(
-    ("total", "left"),
-    [
-        (100, "89 s"),
-        (101, "2 min"),  # 90 s
-        (5410, "90 min"),  # 5399 s
-        (5411, "1.5 h"),  # 5400 s
-        (36011, "10.0 h"),
-    ],
-)
-def test_the_unit_of_the_time_left_grows_with_it(clock, total, left):
-    (line,) = lines(clock, range(1, 12), total, 1.0)
-    assert line == f"bear [11/{total}] at work, {left} left"
-
-
 def test_steps_of_an_earlier_sitting_do_not_count_for_the_pace(clock):
     # 500 steps were done before; now each takes 10 s, and 97 are left after the second of now.
     assert lines(clock, (501, 502, 503), 600, 10.0)[-1] == "bear [503/600] at work, 16 min left"

@@ -479,17 +479,6 @@ def test_a_tiny_autoencoder_is_refused_by_pix2pix_and_taken_beside_a_controlnet(
     assert torch.allclose(editor.pixels(latents), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.door
-def test_networks_are_refused_before_their_weights_are_read(tmp_path):
-    pix2pix().save_pretrained(tmp_path)
-    path = tmp_path / "unet" / "config.json"
-    config = {**json.loads(path.read_text()), "addition_embed_type": "text_time"}
-    path.write_text(json.dumps(config))
-    (tmp_path / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"none can be read")
-    with pytest.raises(InputError, match="is of Stable Diffusion XL's kind"):
-        InstructPix2Pix.from_folder(tmp_path)
-
-
 @pytest.mark.parametrize(("said", "size"), [(8, 16), ([6, 10], 20), (None, 128)])
 def test_an_editors_own_size_is_that_of_its_longest_side(said, size):
     editor = editor_of(pix2pix())

@@ -194,15 +194,3 @@ def test_pairs_that_do_not_fit_are_named(tmp_path_factory, placed):
         encoder.distance(pictures((36, 36)), pictures((36, 40)))
     with pytest.raises(ValueError, match=r"b\[0\]: got values in"):
         encoder.distance(pictures((36, 36)), [2 * pictures((36, 36))[0] - 1])
-
-
-def test_a_file_that_would_run_code_is_not_run(tmp_path):
-    import pickle
-
-    class Trap:
-        def __reduce__(self):
-            return (pytest.fail, ("code in a weights file was run",))
-
-    (tmp_path / "trap.pth").write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(InputError, match="cannot be read as weights"):
-        load_encoder(f"lpips:{tmp_path}")

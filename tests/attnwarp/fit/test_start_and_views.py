@@ -313,19 +313,6 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
     assert len(test) == 2 and not recwarn.list
 
 
-def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
-    """The fifth and the thirteenth picture are held out, and that is the third once more."""
-    paths = [tmp_path / f"{k:02d}.png" for k in range(18)]
-    for k, path in enumerate(paths):
-        seed = 2 if k == 12 else k
-        pixels = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(path)
-    cameras = [camera(8, 6, name=path.name).moved([k, 0, 0]) for k, path in enumerate(paths)]
-    with pytest.warns(InputWarning, match=r"'12\.png', which is '02\.png'"):
-        train, test = hold_out(Dataset(cameras, paths))
-    assert len(train) == 16 and [c.name for c in test.cameras] == ["04.png"]
-
-
 def test_a_single_picture_is_fitted_on_and_not_held_out():
     train, test = hold_out(named(1))
     assert len(train) == 1 and test is None

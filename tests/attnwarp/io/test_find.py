@@ -10,7 +10,6 @@ from attnwarp import Camera
 from attnwarp.command.edit import mask_files, number_of, view_of
 from attnwarp.io import (
     Dataset,
-    FileFormatError,
     read_colmap,
     read_image,
     read_transforms,
@@ -78,13 +77,6 @@ def test_the_images_of_a_colmap_model_are_found(tmp_path, spell):
     data = read_colmap(tmp_path, points=False)
     by_place = sorted(zip([c.position[0] for c in data.cameras], colours(data), strict=True))
     assert [colour for _, colour in reversed(by_place)] == [1, 2, 3]
-
-
-@pytest.mark.door
-def test_a_missing_image_is_named_with_one_of_another_suffix(tmp_path):
-    write_images(tmp_path, ["images/c.png"])
-    with pytest.raises(FileFormatError, match=r"images/c\.jpg; c\.png is there; put them"):
-        read_transforms(transforms(tmp_path, ["images/c.jpg"]))
 
 
 def views(*names):

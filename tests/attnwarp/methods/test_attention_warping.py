@@ -1023,52 +1023,6 @@ def test_progress_ends_at_its_total_and_never_falls(finished):
     assert PROGRESS[-1][2] == "done"
 
 
-def recorded(scene, editor, tmp_path, settings):
-    """The features of the source of an edit."""
-    from attnwarp.editing.recording import record as keep
-    from attnwarp.methods.features import Features
-
-    plan = Features(editor, settings, "cpu").plan((8, 8))
-    with keep(editor, plan) as recording:
-        edit(editor, [scene[2][0]], "a bear", steps=settings.steps)
-    return recording
-
-
-def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor, tmp_path):
-    whole, half = (
-        recorded(scene, editor, tmp_path, replace(QUICK, feature_type=name))
-        for name in ("float32", "float16")
-    )
-    assert whole.bytes == 2 * half.bytes
-    for layer in whole.plan.layers:
-        for timestep in whole.timesteps:
-            exact = whole.features(timestep, layer, "text")
-            assert torch.equal(half.features(timestep, layer, "text"), exact.half())
-
-
-def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
-    """Oracle: a recording of all steps, with the first steps' weights alone, and no warp."""
-    from attnwarp.methods.algorithms.attention_warping import a_t, inject
-
-    settings = replace(QUICK, feature_steps=(0.0, 0.5), stages=1, iterations=0, batch=1)
-    everything = recorded(scene, editor, tmp_path, QUICK)
-    first = settings.feature_range()
-    assert len(first) == QUICK.steps // 2
-    # A view at the source's place takes all of its features.
-    model, views, images = scene
-    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
-    identity = warp_surfaces(views[0], views[0], FLAT, FLAT)
-    pair = model, [views[0], twin], [images[0], images[1]]
-    some = run(pair, editor, settings=settings, warps=lambda source, target: identity)
-    with inject(
-        editor,
-        everything,
-        weight=lambda step, steps: a_t(step, steps) if step in first else 0.0,
-    ):
-        expected = edit(editor, [images[1]], "a bear", steps=QUICK.steps).images[0]
-    assert np.abs(some.edited[1] / 255 - expected).max() < 0.5 / 255 + 1e-4
-
-
 def test_each_kind_of_attention_is_carried_by_a_course_of_its_own(scene, editor):
     """Oracle: a loop that blends each layer's output itself, at the source's place."""
     settings = replace(ONE, steps=4, a0=0.8, decay="by_kind", batch=1)

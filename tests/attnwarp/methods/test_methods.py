@@ -34,7 +34,6 @@ from attnwarp.methods import (
     GuidedSettings,
     IGS2GSSettings,
     WarpedReferenceSettings,
-    attention_warping,
     by_view,
     preset,
 )
@@ -400,17 +399,6 @@ def test_every_method_has_settings_and_presets():
     for name in METHODS:
         values = preset(name).to_dict()
         assert type(preset(name)).from_dict(json.loads(json.dumps(values))) == preset(name)
-
-
-def test_a_view_alone_has_the_source_edit_of_attention_warping_at_the_same_seed(scene, editor):
-    """Two methods that share no loop draw the same noise for the source."""
-    model, views, images = scene
-    same = {"noise": "fresh", "steps": 2, "iterations": 0, "seed": 3}
-    alone = by_view(model, views, images, editor, "blue", ByViewSettings(start=None, **same))
-    warped = attention_warping(
-        model, views, images, editor, "blue", AttentionWarpingSettings(stages=1, **same)
-    )
-    np.testing.assert_array_equal(alone.edited[0], warped.edited[0])
 
 
 def test_no_module_is_hidden_by_a_function_of_its_name():
