@@ -123,7 +123,7 @@ def edit(
     iterations: Annotated[
         int | None,
         of_method(
-            "Tune the splats for so many iterations in each stage (default of extended: 300).",
+            "Tune the splats for so many iterations in each stage (default of extended: 50).",
             "N",
             min=0,
         ),

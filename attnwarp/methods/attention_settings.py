@@ -92,6 +92,8 @@ class AttentionWarpingSettings(MethodSettings):
         training: views that a stage tunes on. "all": the source and everything edited so far.
             "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
             source at every tenth step; 4 of 40 views are then never visited (the released code).
+            "lifted": all of "all", after each splat's colour moved by the change that its pixels
+            ask for (:meth:`attnwarp.methods.tuning.Tuning.lift`).
         color_rate: factor of the published learning rates of colours. Adam moves a coefficient by
             at most its rate in a step: at 1, 900 steps change a colour by at most 0.63.
         psnr_views: views counted in Edit PSNR; the released code uses "before_last_stage".
@@ -142,7 +144,7 @@ class AttentionWarpingSettings(MethodSettings):
     feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
     feature_type: Literal["float32", "float16", "bfloat16"] = "float32"
-    training: Literal["all", "stage", "modulo"] = "all"
+    training: Literal["all", "stage", "modulo", "lifted"] = "all"
     psnr_views: Literal["all", "before_last_stage"] = "all"
 
     def __post_init__(self) -> None:
@@ -267,6 +269,9 @@ PRESETS: dict[str, MethodSettings] = {
         unseen="attend",
         a0=1.0,
         decay="by_kind",
+        training="lifted",
+        iterations=50,
+        color_rate=1.0,
     ),
 }
 """Presets by name, the default first; see :data:`attnwarp.methods.PRESETS`."""

@@ -240,7 +240,7 @@ class AttentionWarping(Method):
                     loop.edit(stage, batch, partial(self.edit_targets, stage, batch), rows=rows)
             # (6) tune the splats on the edited views.
             edited += [view for view in views if view not in edited]
-            if s.training == "all" or not views:
+            if s.training in ("all", "lifted") or not views:
                 loop.tune(stage, edited, s.iterations)
             elif s.training == "stage":
                 loop.tune(stage, views, s.iterations)

@@ -78,7 +78,7 @@ def test_a_short_last_stage_is_filled_with_views_edited_before():
 def test_extended_is_corrected_with_ideas_beyond_the_paper():
     ideas = {
         "noise": "surface", "warp": attnwarp.warp.preset("tolerant"), "unseen": "attend",
-        "a0": 1.0, "decay": "by_kind",
+        "a0": 1.0, "decay": "by_kind", "training": "lifted", "iterations": 50, "color_rate": 1.0,
     }  # fmt: skip
     assert PRESETS["extended"] == replace(PRESETS["corrected"], **ideas)
 

@@ -15,6 +15,7 @@ from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.methods.stages import released_order
 from attnwarp.methods.tuning import DistanceToViews, Tuning
 from attnwarp.render import render
+from attnwarp.trial import disc, view
 from attnwarp.workdir import Workdir
 
 SETTINGS = preset("attention_warping", iterations=40)
@@ -66,6 +67,54 @@ def test_tuning_recolours_the_scene_to_its_pictures():
     tuning.advance(0, 250, training, range(len(views)))
     assert error() < 0.3 * before
     assert sum(tuning.visits.values()) == 250
+
+
+def lifted(views, start, times=1, membership=None):
+    tuning = Tuning(start, views.cameras, SETTINGS, 1, membership=membership)
+    for _ in range(times):
+        tuning.lift(views)
+    return tuning.gaussians()
+
+
+def test_lifting_finds_the_colours_of_recoloured_splats_whatever_masks_hide():
+    start, views = splats(), cameras()
+    goal = replace(start, sh=start.sh.clone())
+    goal.sh[:, 0] += torch.tensor([0.5, 0.2, -0.3])
+    kept = np.arange(32)[None].repeat(32, 0) > 9
+    shown = [np.where(kept[..., None], p, np.float32(1)) for p in pictures(goal, views)]
+    asked = Views(views, shown, masks=[kept] * len(views))
+
+    def error(colors):
+        return float((colors.sh[:, 0] - goal.sh[:, 0]).abs().mean())
+
+    once, often = (error(lifted(asked, start, times)) for times in (1, 20))
+    assert 2 * often < once < 0.05 * error(start)
+    member = np.arange(len(start)) % 2
+    bound = lifted(asked, start, membership=member.astype(np.float64))
+    assert torch.equal(bound.sh[member == 0], start.sh[member == 0])
+    assert not torch.equal(bound.sh[member == 1], start.sh[member == 1])
+    assert torch.equal(bound.means, start.means) and torch.equal(bound.sh[:, 1:], start.sh[:, 1:])
+
+
+def test_a_lifted_splat_takes_the_colour_on_which_most_views_agree():
+    place, wall = view(side=16), disc(20.0)
+    asked = [np.full((16, 16, 3), value, np.float32) for value in (0.8, 0.2, 0.8)]
+    shown = render(lifted(Views([place] * 3, asked), wall, 4), place)
+    assert torch.allclose(shown.color, torch.tensor(0.8), atol=0.02)  # their mean is 0.6
+
+
+def test_only_rounds_with_iterations_of_lifted_training_begin_with_lifting():
+    start, views = splats(), cameras()
+    goal = Views(views, [np.full((c.height, c.width, 3), 0.5, np.float32) for c in views])
+
+    def moved(training, iterations):
+        settings = replace(SETTINGS, training=training, perceptual=0.0)
+        tuning = Tuning(start, views, settings, 40)
+        tuning.advance(0, iterations, goal, range(len(views)))
+        return float((tuning.gaussians().sh[:, 0] - start.sh[:, 0]).abs().max())
+
+    # Adam moves a coefficient by its rate, 0.01, in a step.
+    assert moved("lifted", 0) == 0 and moved("all", 1) < 0.02 < moved("lifted", 1)
 
 
 def test_a_splat_takes_the_share_of_a_step_that_it_belongs():
