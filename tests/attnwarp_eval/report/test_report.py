@@ -561,7 +561,7 @@ def test_the_list_of_used_seeds_has_every_seed_of_studies_and_reports():
 
 
 def test_lines_of_the_readme_are_numbered_from_one_and_at_most_five():
-    places = sorted(claim.headline for claim in load_claims() if claim.headline)
+    places = sorted({claim.headline for claim in load_claims() if claim.headline})
     assert places == list(range(1, len(places) + 1)) and len(places) <= 5
 
 
