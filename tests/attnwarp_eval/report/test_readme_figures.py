@@ -335,6 +335,36 @@ def test_the_page_on_fits_prints_what_was_measured(topic):
     assert [phrase for phrase in topic() if phrase not in told] == []
 
 
+# docs/method/algorithm.md, docs/measuring/evidence.md -----------------------------------------------------------------
+
+
+def parts(region, *variants):
+    """Shares of the parts with the source's colour, in percent, by scene."""
+    metric = f"multiview.same_part.{region}"
+    return [by_scene("parts", "carry", metric, each) for each in variants]
+
+
+def test_the_pages_on_the_method_and_on_evidence_print_what_an_editor_in_parts_gives():
+    method, evidence = (
+        " ".join((ROOT / f"docs/{path}.md").read_text().split())
+        for path in ("method/algorithm", "measuring/evidence")
+    )
+    names = "default", "unseen: free", "each view alone"
+    shares = [np.mean([*of.values()]) for of in parts("unseen", *names)]
+    said = "in {:.0%} of the cases by the default, in {:.0%} edited freely there (`unseen=free`), and in {:.0%} in"
+    assert said.format(*shares).replace("%", " %") in method
+    assert f"On [{scenes_of('parts')} drawn scenes](../../reports/parts" in method
+    seen = parts("seen", "default", "each view alone", "mirrored")
+    default, alone, mirrored = (np.array([of[scene] for scene in seen[0]]) for of in seen)
+    assert f"brings {100 * default.mean():.0f} % of a thing's parts to" in evidence
+    assert f"by the default and {100 * alone.mean():.0f} % alone" in evidence
+    share = (mirrored - alone).mean() / (default - alone).mean()
+    (told,) = in_page("parts/report.md", r"mirrored places reach (\S+ % \([^)]*\)) of the gain")
+    assert (
+        told.startswith(f"{100 * share:.0f} % (") and f"mirrored places reach {told} of" in evidence
+    )
+
+
 # docs/measuring/accuracy-and-time.md ----------------------------------------------------------------------------------
 
 

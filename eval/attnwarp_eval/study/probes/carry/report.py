@@ -34,6 +34,7 @@ class CarryReport(ProbeReport):
         "... where the source does not see them": "multiview.same_part.unseen",
         "colour difference, dE00": "multiview.delta_e",
     }
+    contrasts = tuple(columns.values())
     cost = "whole"
     cost_of = "an edit"
     cost_text = "Seconds are those of the source's edit, the warps and the views' edits."
