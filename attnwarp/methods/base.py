@@ -230,14 +230,12 @@ class Method(ABC):
         inputs: SHA-256 of additional inputs, by name.
         notes: lines reported to the user at the start.
         psnr_leaves_out: numbers of the views that Edit PSNR excludes.
-        tuning: class of the tuning.
     """
 
     about: dict[str, Any] = {}  # noqa: RUF012  (never written to)
     inputs: dict[str, str | None] = {}  # noqa: RUF012
     notes: Sequence[str] = ()
     psnr_leaves_out: Collection[int] = ()
-    tuning: type[Tuning] = Tuning
 
     @abstractmethod
     def run(self, loop: Loop) -> None:
@@ -352,7 +350,7 @@ class _Run:
         self.rounds, self.planned = tuple(plan.rounds), iter(plan.calls)
         bound = work.segments is not None and work.settings.composite == "original"
         self.bound = bound and not options.get("tune_outside", False)
-        self.tuning = method.tuning(
+        self.tuning = Tuning(
             work.frozen, work.views.cameras, work.settings,
             sum(part.iterations for part in self.rounds), work.backend,
             work.membership() if self.bound else None, options.get("load", load_encoder),
