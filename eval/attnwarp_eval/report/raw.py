@@ -47,7 +47,7 @@ FILTERS = [
         "pb": 0,
     }
 ]
-"""How a file is compressed: text takes up to 15 % less than by a preset alone."""
+"""Filters of compression, by which text takes up to 15 % less than by a preset alone."""
 
 DIGITS = 6
 """Significant digits of a figure: the rounding is below every tolerance of a metric."""
