@@ -228,21 +228,24 @@ class Tuning:
         error (Holland and Welsch 1977), where Adam takes hundreds. Geometry stays, and so does how
         colours depend on the direction.
         """
-        colors = self.model.tensors["dc"]
+        colors = self.model.tensors["dc"].detach()
         for _ in range(LIFT_SWEEPS):
-            change, weight = torch.zeros_like(colors), torch.zeros_like(colors)
+            # Drawn as values of their own, since a colour below black has no slope.
+            sums = torch.zeros_like(colors[:, 0].repeat(1, 2))
             for index in range(len(views)):
-                color = self._render(views.cameras[index], "black").color
-                image = views.masked(index, views.exposed(index, color.float()))
-                missing = (target_of(views, index, image.device) - image).detach()
-                trust = 1 / missing.abs().mean(-1, keepdim=True).clamp_min(LIFT_ERROR)
-                trust = views.masked(index, trust.expand_as(missing))
-                for total, of in ((change, missing * trust), (weight, trust)):
-                    (share,) = torch.autograd.grad((color * of).sum(), colors, retain_graph=True)
-                    total += share
+                with torch.no_grad():
+                    color = self._render(views.cameras[index]).color.float()
+                    image = views.masked(index, views.exposed(index, color))
+                    missing = target_of(views, index, image.device) - image
+                    trust = 1 / missing.abs().mean(-1, keepdim=True).clamp_min(LIFT_ERROR)
+                    asked = torch.cat([missing, torch.ones_like(missing)], dim=-1) * trust
+                    asked = views.masked(index, asked)
+                values = torch.zeros_like(sums).requires_grad_(True)
+                drawn = self._render(views.cameras[index], features=values).color
+                sums += torch.autograd.grad((drawn * asked).sum(), values)[0]
+            change, weight = sums[:, None, :3], sums[:, None, 3:]
             step = torch.where(weight > 0, change / weight.clamp_min(LEAST_WEIGHT), 0) / SH_C0
-            with torch.no_grad():
-                colors += step if self.membership is None else step * self.membership[:, None, None]
+            colors += step if self.membership is None else step * self.membership[:, None, None]
 
     def _next(self, count: int, number: int, order: Order | None) -> int:
         if order is not None:
@@ -275,7 +278,9 @@ class Tuning:
             path = folder.path / name
             raise FileFormatError(path, f"lacks something ({error}); remove it") from error
 
-    def _render(self, camera: Camera, background: str) -> Render:
+    def _render(
+        self, camera: Camera, background: Tensor | None = None, features: Tensor | None = None
+    ) -> Render:
         try:
             gaussians = self.model.gaussians()
         except ValueError as error:
@@ -283,14 +288,16 @@ class Tuning:
         return render(
             gaussians,
             camera,
+            features=features,
             backend=self.backend,
-            background=self.model.background(background, self.random),
+            background=background,
             near=self.fit.near * self.model.extent,
         )
 
     def _iterate(self, views: Views, index: int) -> None:
         camera = views.cameras[index]
-        picture = self._render(camera, self.settings.background)
+        background = self.model.background(self.settings.background, self.random)
+        picture = self._render(camera, background)
         loss = self.loss_of(picture, views, index)
         value = float(loss.detach())
         if not math.isfinite(value):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny_scenes import cameras, pictures, splats
 
-from attnwarp import Camera
+from attnwarp import Camera, Gaussians
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import Views
 from attnwarp.methods import preset
@@ -96,10 +96,11 @@ def test_lifting_finds_the_colours_of_recoloured_splats_whatever_masks_hide():
     assert torch.equal(bound.means, start.means) and torch.equal(bound.sh[:, 1:], start.sh[:, 1:])
 
 
-def test_a_lifted_splat_takes_the_colour_on_which_most_views_agree():
-    place, wall = view(side=16), disc(20.0)
+def test_a_lifted_splat_takes_the_colour_on_which_most_views_agree_though_it_was_black():
+    # A colour below black, as fits leave them, draws as black and has no slope.
+    place, black = view(side=16), Gaussians.sh_from_rgb(torch.full((1, 3), -0.5))
     asked = [np.full((16, 16, 3), value, np.float32) for value in (0.8, 0.2, 0.8)]
-    shown = render(lifted(Views([place] * 3, asked), wall, 4), place)
+    shown = render(lifted(Views([place] * 3, asked), replace(disc(20.0), sh=black), 4), place)
     assert torch.allclose(shown.color, torch.tensor(0.8), atol=0.02)  # their mean is 0.6
 
 
