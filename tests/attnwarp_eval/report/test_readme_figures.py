@@ -322,6 +322,21 @@ def default_of_an_edit():
     yield f"by {one.shown(0.9)[0]:.2f} with one"
     tuned = "several answers: 20 steps, tuned", "several answers: 10 steps, tuned half as long"
     yield f"renders by {said.format(*loss('render', *tuned, studies[0]).shown(0.9))}"
+    now = loss("render", "ideal: 3 x 300 iterations", "ideal: default", "tuning-reported")
+    mean, low, high = now.shown(0.9)
+    yield f"nearer to the source's answer by {said.format(-mean, -high, -low)} (ideal editor"
+    one, new_one, many, new_many = re.findall(
+        r"^\| (?:3 x 300 iterations|default) \|.*\| ([\d.]+)[^|]*\| (0\.\d+)[^|]*\|$",
+        page("tuning-reported/report.md"),
+        re.MULTILINE,
+    )
+    yield f"have {new_one[0]} dB to the true edit for {one[0]} (one right answer)"
+    yield f"and {new_many[0]} dB for {many[0]} (several)"
+    yield f"errs by {new_one[1]} for {one[1]}"
+    row = r"whole edit \| \S+ \| (\S+) \| (\S+) \| (\S+) \| (\S+) \|"
+    cpu, wall, cores, same = in_page("editing/whole-edit.md", row)
+    yield f"[{cpu} of its CPU seconds and {wall} of its wall seconds]"
+    yield f"equal code differs by {same}. {cores} of two cores are busy"
 
 
 def test_the_page_on_time_prints_what_the_default_of_an_edit_loses():
