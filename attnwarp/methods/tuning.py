@@ -211,7 +211,7 @@ class Tuning:
         """
         if self.iteration == begin:
             self.queue = []  # the previous round had different views
-            if self.lifts and end > begin:
+            if self.lifts and end > begin and not spent():
                 self.lift(views)
         while self.iteration < end and not spent():
             index = self._next(len(views), self.iteration - begin, order)

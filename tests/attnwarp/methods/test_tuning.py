@@ -108,14 +108,15 @@ def test_only_rounds_with_iterations_of_lifted_training_begin_with_lifting():
     start, views = splats(), cameras()
     goal = Views(views, [np.full((c.height, c.width, 3), 0.5, np.float32) for c in views])
 
-    def moved(training, iterations):
+    def moved(training, iterations, spent=False):
         settings = replace(SETTINGS, training=training, perceptual=0.0)
         tuning = Tuning(start, views, settings, 40)
-        tuning.advance(0, iterations, goal, range(len(views)))
+        tuning.advance(0, iterations, goal, range(len(views)), spent=lambda: spent)
         return float((tuning.gaussians().sh[:, 0] - start.sh[:, 0]).abs().max())
 
     # Adam moves a coefficient by its rate, 0.01, in a step.
-    assert moved("lifted", 0) == 0 and moved("all", 1) < 0.02 < moved("lifted", 1)
+    assert moved("lifted", 0) == 0 == moved("lifted", 1, spent=True)
+    assert moved("all", 1) < 0.02 < moved("lifted", 1)
 
 
 def test_a_splat_takes_the_share_of_a_step_that_it_belongs():
