@@ -283,6 +283,12 @@ def test_the_block_of_an_own_capture_runs_as_printed(page, word, folder, tmp_pat
     assert page != "README.md" or (tmp_path / "scene.png").is_file()
 
 
+def test_the_first_study_of_a_newcomer_can_be_read(tmp_path):
+    (study,) = blocks("docs/start/quickstart.md", ("yaml",))
+    (tmp_path / "mine.yaml").write_text(study)
+    assert load_study(str(tmp_path / "mine.yaml")).scenes == ["bear", "spheres"]
+
+
 def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path):
     """Oracle: the comments of the page."""
     _, extending = blocks("docs/measuring/studies.md", ("yaml",))
