@@ -1,5 +1,4 @@
-"""Ctrl-C and a polite kill of a run on worker processes. Oracles: the process table, a run that was never
-disturbed."""
+"""Ctrl-C and kills of a run on worker processes. Oracles: the process table, a run that was never disturbed."""
 
 import os
 import pathlib
@@ -86,6 +85,8 @@ def finish(folder, run):
         # As a terminal does.
         pytest.param("a cell is written", os.killpg, signal.SIGINT, marks=pytest.mark.slow),
         pytest.param("workers start", os.killpg, signal.SIGINT, marks=pytest.mark.slow),
+        # As a machine does that runs out of memory: nobody is left to say anything.
+        pytest.param("a cell is written", os.killpg, signal.SIGKILL, marks=pytest.mark.slow),
     ],
 )
 def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
@@ -107,10 +108,13 @@ def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
         time.sleep(0.01)
     send(process.pid, number)
     message = process.communicate(timeout=120)[1]
-    assert process.returncode == 130
     kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").rglob("*.json")}
-    last = f"stopped; {len(kept)} cells are kept, the same command goes on from here\n"
-    assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
+    if number == signal.SIGKILL:
+        assert process.returncode == -number
+    else:
+        assert process.returncode == 130
+        last = f"stopped; {len(kept)} cells are kept, the same command goes on from here\n"
+        assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
     assert started and not any(map(is_worker, started))
     assert len(own) <= min(core_count(), 4)  # cells
     results = finish(tmp_path, run)
