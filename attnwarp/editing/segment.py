@@ -7,6 +7,7 @@ clip-parts.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from attnwarp.encoders import load_encoder
 from attnwarp.encoders.base import PlaceEncoder, checked_image
-from attnwarp.errors import InputError, optional_imports
+from attnwarp.errors import InputError, InputWarning, optional_imports
 
 Image = npt.NDArray[Any]
 """(H, W, 3) sRGB, floating, in [0, 1]."""
@@ -289,7 +290,8 @@ class ClipSegmenter:
     Args:
         likely: lower bound of the probability of initial foreground pixels.
         background: probability below which a pixel never joins the mask.
-        sure: probability from which a pixel always stays in the mask.
+        sure: probability from which a pixel always stays in the mask. If none reaches it, a warning
+            says that the words are hardly recognised.
         detection: lower bound of the best pixel's probability, in [0, 1].
 
     Example:
@@ -326,6 +328,13 @@ class ClipSegmenter:
         mask = self._cut(picture, probability)
         if not mask.any():
             raise NoDetectionError(text)
+        if (best := probability.max()) < self.sure:
+            warnings.warn(
+                f"{text!r} is hardly recognised: {best:.0%} likely at best, {self.sure:.0%} is"
+                " sure; if what is marked is something else, mark the thing itself (--at X,Y)",
+                InputWarning,
+                stacklevel=2,
+            )
         if mask.shape != (height, width):
             share = cv2.resize(mask.astype(np.float32), (width, height))
             mask = np.asarray(share > 0.5)
