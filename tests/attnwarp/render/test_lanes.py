@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 from attnwarp.render._kernels import (
-    binning,
     lanes,
-    layout,
     projection,
 )
 
@@ -93,67 +91,3 @@ def test_eight_float64_to_the_last_bits() -> None:
             assert np.abs(y[24:] - np.log(x)).max() < 1e-12 * max(1, np.abs(np.log(x)).max())
     work(np.zeros(8), y)
     assert (y[16:24] == 0).all()
-
-
-def test_float64_are_rounded_to_float32_when_stored_so() -> None:
-    @numba.njit
-    def work(x, y):
-        lanes.store8(y, 3, lanes.load8(x, 0) * 1.0)
-
-    x, y = np.random.default_rng(0).normal(size=8), np.full(12, 7, np.float32)
-    work(x, y)
-    assert (y[3:11] == x.astype(np.float32)).all() and (y[[0, 1, 2, 11]] == 7).all()
-
-
-def test_bits_of_sixteen_words() -> None:
-    @numba.njit
-    def work(words, wanted):
-        left, seen = lanes.with_any_bit(words, 0, wanted), 0
-        while left != 0:
-            k = lanes.lowest_bit(left)
-            left &= left - 1
-            seen = seen * 16 + k
-        return lanes.with_any_bit(words, 0, wanted), seen
-
-    random = np.random.default_rng(0)
-    for wanted in (1, 1 << 15, 0x33 << 10, 0xFFFF):
-        words = random.integers(0, 1 << 16, 16).astype(np.int32) & random.integers(
-            0, 1 << 16, 16
-        ).astype(np.int32)
-        places = [k for k in range(16) if int(words[k]) & wanted]
-        bits, order = work(words, wanted)
-        assert bits == sum(1 << k for k in places)
-        assert order == int("0" + "".join(f"{k:x}" for k in places), 16) & ((1 << 64) - 1)
-
-
-def test_ends_and_neighbours() -> None:
-    @numba.njit
-    def work(x, y, ends, whole):
-        first, last = lanes.load(x, 0), lanes.load(x, 16)
-        lanes.store_intervals(ends, 0, first, last)
-        lanes.store_integers(whole, 0, last)
-        lanes.store(y, 0, lanes.swap1(first))
-        lanes.store(y, 16, lanes.swap2(first))
-
-    x = np.r_[np.arange(16) * 2000 + 0.75, np.arange(16) - 1].astype(np.float32)
-    y, ends, whole = np.zeros(32, np.float32), np.zeros(16, np.int32), np.zeros(16, np.int32)
-    work(x, y, ends, whole)
-    assert (ends & 0xFFFF == np.arange(16) * 2000).all()
-    assert (ends >> 16 == np.arange(16) - 1).all() and (whole == np.arange(16) - 1).all()
-    assert (y[:16] == x[:16].reshape(8, 2)[:, ::-1].ravel()).all()
-    assert (y[16:] == x[:16].reshape(4, 2, 2)[:, ::-1].ravel()).all()
-
-
-@pytest.mark.parametrize(("begin", "end"), [(0, 0), (2, 9), (5, 55), (0, 55)])
-def test_a_row_of_squares_as_bits(begin, end) -> None:
-    """Bits of a run from column 40 on, in both ways that lists are filled."""
-    code = 40 + begin | 40 + end << 16
-    row = [begin <= column <= end for column in range(56)]
-    assert binning._row_bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
-    for column in range(0, 56, layout.SIDE):
-        part = row[column : column + layout.SIDE]
-        assert binning._tile_bits(code, 40 + column) == sum(
-            1 << k for k, inside in enumerate(part) if inside
-        )
-    nothing = 32767 | -1 << 16
-    assert binning._row_bits(nothing, 40) == binning._tile_bits(nothing, 40) == 0
