@@ -153,20 +153,6 @@ def test_a_choice_that_is_none_is_told_in_the_words_of_the_command_line(tmp_path
     assert "Invalid value for '--kind': 'foo' is not one of '2dgs', '3dgs'." in done.stderr
 
 
-def test_the_help_of_each_option_is_a_sentence_and_that_of_edit_begins_with_what_most_set():
-    for name, command in get_command(app).commands.items():
-        for option in command.params:
-            said = option.help or ""
-            first = said.split(" ")[0]
-            assert said[-1:] == "." and len(said.split()) >= 4, (name, option.name, said)
-            assert first not in {"Of", "At", "As", "Its", "How", "What", "None", "Any"}, said
-    text = CliRunner().invoke(app, ["edit", "--help"], env={"COLUMNS": "100"}).stdout
-    names = ("instruction", "editor", "out", "source", "at", "box", "where", "mask", "masks",
-             "segmenter", "method", "seconds", "ply", "control", "device", "format")  # fmt: skip
-    places = [re.search(rf"\s--{name}\s", text).start() for name in names]
-    assert places == sorted(places)
-
-
 def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path):
     edit = ["edit", "data", "--out", str(tmp_path / "out"), "--instruction"]
     image = ["edit-image", "a.png", "--out", str(tmp_path / "a.png"), "--instruction"]

@@ -396,9 +396,10 @@ def test_the_controlnets_attention_is_aligned_where_the_settings_say(run):
 
 def test_every_method_has_settings_and_presets():
     assert set(METHODS) == set(methods.PRESETS)
-    for name in METHODS:
-        values = preset(name).to_dict()
-        assert type(preset(name)).from_dict(json.loads(json.dumps(values))) == preset(name)
+    for presets in PRESETS.values():
+        for settings in presets.values():
+            text = json.dumps(settings.to_dict())
+            assert type(settings).from_dict(json.loads(text)) == settings
 
 
 def test_no_module_is_hidden_by_a_function_of_its_name():

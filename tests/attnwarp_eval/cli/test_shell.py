@@ -79,24 +79,21 @@ def test_without_a_command_a_newcomer_reads_what_to_do_first():
     assert [line[1] for line in lines] == ["run", "inspect", "metrics", "compare"]
 
 
-@pytest.mark.parametrize("name", list(main.COMMANDS))
-def test_each_options_help_is_a_sentence(name):
-    found = typer.main.get_command(main.app).commands.get(name)
-    for command in getattr(found, "commands", {name: found}).values():
-        texts = {p.name: p.help for p in command.params if isinstance(p, TyperOption)}
-        for option, text in texts.items():
-            told = f"{command.name} --{option}: {text}"
-            assert text[0].isupper() and text.endswith(".") and len(text.split()) > 3, told
+def commands(group, *words):
+    """A group and the commands below it, each with the words that call it."""
+    yield [*words], group
+    for name, command in getattr(group, "commands", {}).items():
+        yield from commands(command, *words, name)
 
 
 @pytest.mark.parametrize("app", [main.app, attnwarp.cli.main.app])
-def test_no_flag_seems_to_take_a_value(app):
-    def commands(group, words):
-        yield words
-        for name, command in getattr(group, "commands", {}).items():
-            yield from commands(command, [*words, name])
-
-    for words in commands(typer.main.get_command(app), []):
+def test_each_options_help_is_a_sentence_and_no_flag_seems_to_take_a_value(app):
+    for words, command in commands(typer.main.get_command(app)):
+        options = [option for option in command.params if isinstance(option, TyperOption)]
+        for option in options if words else ():
+            text = option.help or ""
+            told = f"{' '.join(words)} --{option.name}: {text}"
+            assert text[:1].isupper() and text.endswith(".") and len(text.split()) > 3, told
         help_of = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "120"})
         assert "--help" in help_of.stdout and "<bool>" not in help_of.stdout, words
 
