@@ -291,25 +291,6 @@ def test_a_worker_that_cannot_read_what_its_cells_need_is_refused_by_name(tmp_pa
     assert str(raised.value).endswith(told)
 
 
-def test_workers_that_start_together_start_with_different_probes_and_get_every_cell_once():
-    cells = [
-        attnwarp_eval.study.cluster.Cell({}, scene, "v", probe, 0)
-        for scene in "ab"
-        for probe in ("depth", "warp")
-    ]
-    queue = attnwarp_eval.study.cluster._Queue(cells)
-    first = queue.take(None)
-    second = queue.take(None, {first.probe})
-    assert (first.title, second.title) == (
-        "a / v / depth",
-        "b / v / warp",
-    )  # no kernel is compiled twice
-    # From then on a worker takes what comes first, whatever the other is at.
-    rest = [queue.take("b", {"depth"}), queue.take("a", {"warp"})]
-    assert [cell.title for cell in rest] == ["b / v / depth", "a / v / warp"]
-    assert queue.take("a") is None
-
-
 def test_a_worker_gets_a_scenes_files_again_when_it_comes_back_or_a_cell_of_it_fails(monkeypatch):
     """A new process under an old address has none; nor has one whose disk was full."""
     cluster = attnwarp_eval.study.cluster

@@ -7,11 +7,9 @@ import pytest
 import yaml
 
 from attnwarp.warp import preset
-from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import Store, StudyError, cells_of, load_study
+from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import world
@@ -83,16 +81,6 @@ def test_an_exact_mask_carries_no_label_to_what_the_source_does_not_see(tmp_path
     exact = views["exact mask"]
     assert exact["labels.painted_hidden"] == 0 < views["everywhere"]["labels.painted_hidden"]
     assert exact["labels.none"] < 0.1 < views["exact"]["labels.none"]
-
-
-def test_the_report_tells_a_warp_without_rules_from_one_with_them(tmp_path):
-    study = load(tmp_path)
-    store = Store(tmp_path / "run")
-    planned = plan(study, store)
-    execute(planned, store)
-    write_report(store)
-    text = (tmp_path / "run/report.md").read_text()
-    assert "painted, hidden" in text
 
 
 @pytest.mark.door

@@ -130,8 +130,3 @@ def test_a_file_in_place_of_the_results_folder_is_answered_before_the_work(tmp_p
     assert done.exit_code == 2
     assert "taken: --out is a file, expected a folder" in done.output.replace("\n", "")
     assert taken.read_text() == "mine"
-
-
-def test_one_person_is_not_called_people(tmp_path):
-    done = score(answers(tmp_path, "a", [choice("q", "x", "y", "left")]))
-    assert done.output.startswith("1 person made 1 choice between 2 methods")
