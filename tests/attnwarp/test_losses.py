@@ -9,7 +9,6 @@ import torch
 
 from attnwarp import Camera, Gaussians, losses
 from attnwarp.render import render
-from attnwarp.render.threads import set_thread_count
 
 
 def pictures(height=40, width=52, channels=3, dtype=torch.float64, seed=0):
@@ -216,22 +215,6 @@ def test_kernels_of_normal_consistency_have_the_definitions_value_and_gradients(
         # Differences of float32 points keep 4 to 5 digits; the largest gradients set the scale.
         scale = max(float(expected.abs().max()), 1e-12)
         assert float((got - expected).abs().max()) < 2e-5 * scale, name
-
-
-def test_bits_of_normal_consistency_do_not_depend_on_threads():
-    results = []
-    try:
-        for threads in (1, 2, 5):
-            set_thread_count(threads)
-            view, _ = hilly(70, 50)
-            value = losses.normal_consistency(view)
-            value.backward()
-            results.append([value.detach(), *(getattr(view, n).grad for n in ("depth", "normal"))])
-    finally:
-        set_thread_count(None)
-    for other in results[1:]:
-        for first, second in zip(results[0], other, strict=True):
-            assert torch.equal(first, second)
 
 
 def test_normal_consistency_moves_a_camera_whose_pose_has_a_gradient():

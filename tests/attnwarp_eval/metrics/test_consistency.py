@@ -13,7 +13,6 @@ from attnwarp.camera import Camera
 from attnwarp.warp.sampling import sample_at
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_linear, to_srgb
-from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.shapes import Rectangle
 from attnwarp_eval.truth import Geometry, appearance, two_view
@@ -226,12 +225,3 @@ def test_pictures_too_small_for_flow_have_none(shape):
     figures = metrics.disagreement_at(flat, flat, flow.xy, flow.accepted).figures("flow_")
     assert figures.pop("consistency.flow_pixels") == 0
     assert all(math.isnan(value) for value in figures.values())
-
-
-def test_every_figure_is_registered():
-    pair, source, target = sideways(2.0, size=32)
-    exact, flow = metrics.cross_view(source, target, pair), metrics.optical_flow(source, target)
-    along = metrics.disagreement_at(source, target, flow.xy, flow.accepted)
-    names = [*exact.figures(), *along.figures("flow_")]
-    assert len(names) == len(set(names)) == 2 * 3
-    assert all(metric(name).name == name for name in names)
