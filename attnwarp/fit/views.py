@@ -219,6 +219,14 @@ class Views:
             return color
         return expose(color, torch.from_numpy(np.asarray(change)).to(color))
 
+    def gain(self, index: int, like: torch.Tensor) -> torch.Tensor:
+        """Return the slope (3, 3) of an exposed picture's colours to a render's."""
+        change = self.exposures[index]
+        gain = torch.eye(3, dtype=like.dtype, device=like.device)
+        return (
+            gain if change is None else gain + torch.from_numpy(np.asarray(change)).to(gain)[:, :3]
+        )
+
     def error(self, index: int, image: torch.Tensor, background: torch.Tensor) -> float:
         """Mean squared error of a render (H, W, 3) against a picture, where that is not ignored;
         NaN if all of it is.

@@ -363,7 +363,7 @@ class _Run:
         self.done = {"edit": 0, "tune": 0}  # steps of denoising, iterations of tuning
         self.total = {
             "edit": sum(len(part.views) for part in self.rounds) * work.settings.steps,
-            "tune": sum(part.iterations for part in self.rounds),
+            "tune": sum(self.tuning.steps(len(p.training), p.iterations) for p in self.rounds),
         }
         self.folder.folders = (
             *FOLDERS, *(f"rounds/{number + 1}" for number in range(len(self.rounds))),
@@ -516,7 +516,7 @@ class _Run:
         end, state = begin + iterations, f"rounds/{number + 1}.pt"
         if self.folder.has(state):
             self.tuning.restore(self.folder, state)
-            self.done["tune"] += self.tuning.iteration - begin
+            self.done["tune"] += self.tuning.steps(len(views), self.tuning.iteration - begin)
         finished = self.folder.has(state) and self.tuning.iteration >= end
         training = [view for view in views if view in self.latest]
         if not training or (cut is not None and cut["limit"] == "seconds"):
@@ -536,15 +536,19 @@ class _Run:
         state: str,
         order: Order | None,
     ) -> None:
+        text = f"round {number + 1} of {len(self.rounds)}: tuning"
+        self._tell(text)
         if self.work.backend in ("auto", "cpu"):
             # Excluded from the budget's seconds.
             compile_kernels(self.work.frozen.kind, device=self.tuning.model.device)
         views = self._training(training)
-        text = f"round {number + 1} of {len(self.rounds)}: tuning"
 
         def step() -> None:
-            self._tell(f"{text}, loss {self.tuning.loss:.4f}", tune=1)
-            if self.tuning.iteration < end and self.clock.due:
+            lifting = self.tuning.iteration == begin
+            what = "colours" if lifting else f"loss {self.tuning.loss:.4f}"
+            self._tell(f"{text}, {what}", tune=1)
+            # Lifting begins anew if killed.
+            if begin < self.tuning.iteration < end and self.clock.due:
                 with self.clock.saving():
                     self.folder.save(state, self.tuning.state())
                     self.seconds.write()

@@ -208,18 +208,32 @@ class Tuning:
             numbers: their numbers among all views, for :attr:`visits`.
             order: order of the views; None takes each once before any comes again, at random.
             spent: function that returns True once no further iteration may begin.
+            step: function to call after each of the round's :meth:`steps`.
         """
         if self.iteration == begin:
             self.queue = []  # the previous round had different views
-            if self.lifts and end > begin and not spent():
-                self.lift(views)
+            if self.lifts and end > begin:
+                self.lift(views, spent=spent, step=step)
         while self.iteration < end and not spent():
             index = self._next(len(views), self.iteration - begin, order)
             self._iterate(views, index)
             self.visits[numbers[index]] = self.visits.get(numbers[index], 0) + 1
             step()
 
-    def lift(self, views: Views) -> None:
+    def steps(self, views: int, iterations: int) -> int:
+        """Count the steps of a round's first iterations: those, and the views that lifting sweeps.
+
+        A view of a sweep takes about as long as an iteration.
+        """
+        return iterations + (LIFT_SWEEPS * views if self.lifts and iterations else 0)
+
+    def lift(
+        self,
+        views: Views,
+        *,
+        spent: Callable[[], bool] = lambda: False,
+        step: Callable[[], None] = lambda: None,
+    ) -> None:
         """Move each splat's colour by the mean change that its pixels in all views ask for.
 
         A pixel counts by the splat's share of it, and the less the farther it is from its picture,
@@ -227,25 +241,36 @@ class Tuning:
         colours, so these are steps of SIRT (Gilbert 1972) with weights for the least absolute
         error (Holland and Welsch 1977), where Adam takes hundreds. Geometry stays, and so does how
         colours depend on the direction.
+
+        Args:
+            spent: function that returns True once no further view may begin. A sweep that it ends
+                changes nothing, as a part of the views would pull all splats their way.
+            step: function to call after each view.
         """
         colors = self.model.tensors["dc"].detach()
         for _ in range(LIFT_SWEEPS):
             # Drawn as values of their own, since a colour below black has no slope.
             sums = torch.zeros_like(colors[:, 0].repeat(1, 2))
             for index in range(len(views)):
+                if spent():
+                    return
                 with torch.no_grad():
                     color = self._render(views.cameras[index]).color.float()
                     image = views.masked(index, views.exposed(index, color))
                     missing = target_of(views, index, image.device) - image
                     trust = 1 / missing.abs().mean(-1, keepdim=True).clamp_min(LIFT_ERROR)
-                    asked = torch.cat([missing, torch.ones_like(missing)], dim=-1) * trust
+                    # A picture that is exposed asks by its gain, and knows as much.
+                    gain = views.gain(index, missing)
+                    known = (gain.abs().sum(1) @ gain.abs()).expand_as(missing)
+                    asked = torch.cat([missing @ gain, known], dim=-1) * trust
                     asked = views.masked(index, asked)
                 values = torch.zeros_like(sums).requires_grad_(True)
                 drawn = self._render(views.cameras[index], features=values).color
                 sums += torch.autograd.grad((drawn * asked).sum(), values)[0]
+                step()
             change, weight = sums[:, None, :3], sums[:, None, 3:]
-            step = torch.where(weight > 0, change / weight.clamp_min(LEAST_WEIGHT), 0) / SH_C0
-            colors += step if self.membership is None else step * self.membership[:, None, None]
+            moved = torch.where(weight > 0, change / weight.clamp_min(LEAST_WEIGHT), 0) / SH_C0
+            colors += moved if self.membership is None else moved * self.membership[:, None, None]
 
     def _next(self, count: int, number: int, order: Order | None) -> int:
         if order is not None:

@@ -1,6 +1,7 @@
 # ruff: noqa: F811  (fixtures that are imported)
 """Oracles: rows counted by hooks on the network, bytes of files, a clock that counts."""
 
+import contextlib
 import json
 import math
 import shutil
@@ -96,6 +97,35 @@ def test_the_first_estimate_of_the_time_left_is_right_within_a_factor_of_two(run
     run("igs2gs", settings, report=Watched(step))
     first, left = next((at, left) for at, left in told if not math.isnan(left))
     assert 0.5 < left / (told[-1][0] - first) < 2
+
+
+def test_lifting_is_told_of_and_begins_anew_when_it_is_killed(run, tmp_path):
+    """Oracles: 2 steps of 3 edits, 3 sweeps of 2 and of 3 views, and twice 2 iterations; the bytes
+    of a run that was left alone."""
+    settings = replace(QUICK["attention_warping"], training="lifted")
+
+    def told(folder, moment=math.inf):
+        steps = []
+
+        def step(done, total, text, left):
+            assert total == 2 * 3 + 3 * (2 + 3) + 2 * 2
+            steps.append((done, text))
+            if len(steps) == moment:
+                raise Killed
+
+        with contextlib.suppress(Killed):
+            run(
+                "attention_warping", settings, folder=tmp_path / folder, report=Watched(step),
+                checkpoint_seconds=0,
+            )  # fmt: skip
+        return steps
+
+    whole = told("whole")
+    last = [done for done, text in whole if "round 2 of 2: tuning" in text]
+    assert last == [*range(14, 26)]
+    told("killed", [done for done, _ in whole].index(20))
+    assert told("killed")[-1] == (25, "done")
+    assert files(tmp_path / "killed") == files(tmp_path / "whole")
 
 
 # --- killed and resumed

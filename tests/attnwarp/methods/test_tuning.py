@@ -10,6 +10,7 @@ from tiny_scenes import cameras, pictures, splats
 from attnwarp import Camera, Gaussians
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import Views
+from attnwarp.gaussians import SH_C0
 from attnwarp.methods import preset
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.methods.stages import released_order
@@ -102,6 +103,91 @@ def test_a_lifted_splat_takes_the_colour_on_which_most_views_agree_though_it_was
     asked = [np.full((16, 16, 3), value, np.float32) for value in (0.8, 0.2, 0.8)]
     shown = render(lifted(Views([place] * 3, asked), replace(disc(20.0), sh=black), 4), place)
     assert torch.allclose(shown.color, torch.tensor(0.8), atol=0.02)  # their mean is 0.6
+
+
+def test_a_picture_exposed_four_times_as_bright_asks_for_a_quarter_of_its_change():
+    place, brighter = view(side=16), np.c_[np.diag([3.0] * 3), [0.1] * 3]  # shows 4 c + 0.1
+    asked = Views([place], [np.full((16, 16, 3), 0.9, np.float32)], exposures=[brighter])
+    shown = render(lifted(asked, disc(20.0)), place)
+    assert torch.allclose(shown.color, torch.tensor(0.2), atol=0.01)
+
+
+def densely_lifted(views, start):
+    """Colours (N, 3) after three sweeps, by dense matrices in float64 and a loop over pixels'
+    channels, before and after a clamp at black."""
+    one_hot = torch.eye(len(start))
+    shares = [render(start, c, features=one_hot).color.double().numpy() for c in views.cameras]
+    colors = 0.5 + SH_C0 * start.sh[:, 0].double().numpy()
+    for _ in range(3):
+        change, weight = np.zeros_like(colors), np.zeros_like(colors)
+        for k, share in enumerate(shares):
+            gain, offset = np.eye(3), np.zeros(3)
+            if views.exposures[k] is not None:
+                gain, offset = gain + views.exposures[k][:, :3], views.exposures[k][:, 3]
+            kept = np.ones(share.shape[:2], bool) if views.masks[k] is None else views.masks[k]
+            for a, target in zip(share[kept], views.images[k][kept].astype(float), strict=True):
+                slope = np.einsum("i,oc->oic", a, gain)
+                missing = target - np.einsum("oic,ic->o", slope, np.maximum(colors, 0)) - offset
+                trust = 1 / max(np.abs(missing).mean(), 0.03)
+                change += trust * np.einsum("oic,o->ic", slope, missing)
+                weight += trust * np.outer(a, np.abs(gain).sum(1) @ np.abs(gain))
+        colors += np.where(weight > 0, change / np.maximum(weight, 1e-3), 0)
+    return colors
+
+
+ODD = {
+    "saturated": {"images": [0.0, 1.0, 1.0]},
+    "contradicting": {"images": [0.1, 0.9]},
+    "a view that masks ignore": {"images": [0.2, 1.0], "masks": [None, np.zeros((16, 16), bool)]},
+    "exposed from a hundredth to a hundred": {
+        "images": [0.004, 1.0, 0.5],
+        "exposures": [np.c_[np.diag(g - 1), [0.0] * 3] for g in np.outer([0.01, 100, 1], [1] * 3)],
+    },
+    "channels that mix": {"images": [0.5], "exposures": [np.full((3, 4), 0.2)]},
+    "far from any colour": {"images": [0.5, 0.5], "factor": 1e4},
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_lifting_is_a_dense_solution_in_float64_also_in_hard_cases(case):
+    """With splats that are huge, tiny, edge-on, hidden by three others, and behind the cameras,
+    which keep their bytes."""
+    known = {"factor": 1.0, **ODD[case]}
+    count, start = len(known["images"]), splats(8)
+    means, scales, opacities = start.means.clone(), start.scales.clone(), start.opacities.clone()
+    means[7], scales[0], scales[1] = torch.tensor([0.0, 0, 9]), 1e3, 1e-6
+    means[2:6], opacities[2:6] = torch.tensor([[0.1, 0.1, z] for z in (0.3, 0.2, 0.1, 0)]), 0.99
+    quats = start.quats.clone()
+    quats[6] = torch.tensor([1.0, 1, 0, 0]) / 2**0.5  # turned by a right angle
+    start = replace(
+        start, means=means, scales=scales, opacities=opacities, quats=quats,
+        sh=known["factor"] * start.sh,
+    )  # fmt: skip
+    images = [np.full((16, 16, 3), value, np.float32) for value in known["images"]]
+    nothing = [None] * count
+    views = Views.unchecked(
+        cameras(count, 16), images, known.get("masks", nothing), known.get("exposures", nothing)
+    )
+    found = lifted(views, start).sh[:, 0]
+    colors = 0.5 + SH_C0 * found.double().numpy()
+    np.testing.assert_allclose(colors, densely_lifted(views, start), rtol=2e-3, atol=2e-4)
+    assert torch.equal(found[7], start.sh[7, 0])
+
+
+def test_a_sweep_that_the_budget_ends_changes_nothing(monkeypatch):
+    start, views = splats(8), cameras(2, 16)
+    goal = Views(views, [np.full((16, 16, 3), value, np.float32) for value in (0.2, 0.9)])
+
+    def after(views_left):
+        tuning, asked, steps = Tuning(start, views, SETTINGS, 1), iter(range(99)), []
+        tuning.lift(goal, spent=lambda: next(asked) >= views_left, step=lambda: steps.append(1))
+        assert len(steps) <= views_left
+        return tuning.gaussians().sh
+
+    assert torch.equal(after(1), start.sh) and torch.equal(after(3), after(2))
+    assert torch.equal(after(99), lifted(goal, start).sh)
+    monkeypatch.setattr("attnwarp.methods.tuning.LIFT_SWEEPS", 1)
+    assert torch.equal(after(2), lifted(goal, start).sh)
 
 
 def test_only_rounds_with_iterations_of_lifted_training_begin_with_lifting():
