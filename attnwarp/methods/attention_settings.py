@@ -61,7 +61,8 @@ class AttentionWarpingSettings(MethodSettings):
         guidance_drop: decrease of ``text_guidance`` per further stage; the result must not fall
             below 0.
         source_text_guidance: s_T of the source; None for the first stage's.
-        batch: number of target views per network pass. Results depend on it in the last bits.
+        batch: number of target views edited together; on a CPU the threads divide them among
+            themselves (:mod:`attnwarp.editing.lanes`). Results depend on it in the last bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
         mask: True injects only inside M; False wherever the target has a depth (ablation "no M").
         outside: features of points that project outside the source: the "border"'s, or "zeros", as

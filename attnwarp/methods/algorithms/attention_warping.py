@@ -9,11 +9,12 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, groupby
 from numbers import Integral
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ from attnwarp.editing import injection
 from attnwarp.editing.editor import Editor, edit
 from attnwarp.editing.injection import TokenWarp
 from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
+from attnwarp.editing.lanes import editors_for, parts_for, side_by_side
 from attnwarp.editing.layers import Kind, Layer
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.schedule import Size, Time
@@ -274,27 +276,46 @@ class AttentionWarping(Method):
     ) -> list[ViewEdit]:
         """Warp the source's features to views of one size and edit the views (lines 4 and 5)."""
         work, s = self.work, self.settings
-        source = self.recorded
         with work.folder.seconds.part("warp"):
             warps = [self.warp(view, model) for view in batch]
-        with work.guided(s.guidance(stage)), ExitStack() as stack:
+        with work.guided(s.guidance(stage)):
             start = self.referenced(self.start(batch, model, stage=stage), warps)
-            self.attend(stack, batch, warps)
-            if source.recording is not None:
+        editors = editors_for(work.editor, len(batch))
+        jobs = [
+            partial(self._with(editor)._edit_part, stage, start.part(part), warps[part])
+            for editor, part in zip(editors, parts_for(len(batch), len(editors)), strict=True)
+        ]
+        pictures = side_by_side(jobs, step)
+        return [
+            self.result(view, picture, warp)
+            for view, picture, warp in zip(batch, pictures, warps, strict=True)
+        ]
+
+    def _with(self, editor: Editor) -> Self:
+        """Copy this with another editor, and with the source, which is recorded once."""
+        other = copy(self)
+        other.work = copy(self.work)
+        other.work.editor = editor
+        other.keep(self.recorded)
+        return other
+
+    def _edit_part(
+        self, stage: int, start: Start, warps: Sequence[WarpedView | None], step: Callable[[], None]
+    ) -> list[Image]:
+        """Edit views of a batch with the source's features."""
+        work, s = self.work, self.settings
+        recording = self.recorded.recording
+        with work.guided(s.guidance(stage)), ExitStack() as stack:
+            self.attend(stack, start.views, warps)
+            if recording is not None:
                 layers = [self.of_features(warp) for warp in warps]
                 for kind in {layer.kind for layer in self.features.layers}:
                     same = [layer for layer in self.features.layers if layer.kind == kind]
                     weight = partial(a_t, s=s, kind=kind)
                     stack.enter_context(
-                        inject(
-                            work.editor, source.recording, warps=layers, layers=same, weight=weight
-                        )
+                        inject(work.editor, recording, warps=layers, layers=same, weight=weight)
                     )
-            pictures = self.denoise(start, warps, step)
-        return [
-            self.result(view, picture, warp)
-            for view, picture, warp in zip(batch, pictures, warps, strict=True)
-        ]
+            return self.denoise(start, warps, step)
 
     def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
         """Count bytes of features; average the warps' weights, before a_t."""
@@ -606,6 +627,16 @@ class Start:
     pictures: Sequence[Image] = ()
     latents: Tensor | None = None
     replayed: tuple[Image, Any, NoiseMaps] | None = None
+
+    def part(self, part: slice) -> Start:
+        """Return some of the views."""
+        return replace(
+            self,
+            views=self.views[part],
+            guides=self.guides[part],
+            pictures=self.pictures[part],
+            latents=None if self.latents is None else self.latents[part],
+        )
 
 
 def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | None:

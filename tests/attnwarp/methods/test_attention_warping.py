@@ -1123,6 +1123,25 @@ def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
         run(scene, depth_editor, None, settings)
 
 
+def test_views_edited_side_by_side_have_the_bits_of_views_edited_in_turn(scene, editor):
+    settings = replace(QUICK, **IDEAS, unseen="attend", stages=1, iterations=0)
+    more = {"segments": [np.ones((32, 32), bool)] * len(scene[1])}
+    in_turn = run(scene, editor, settings=replace(settings, batch=1), **more)
+    steps = []
+
+    def spread(*step):
+        steps.append(step)
+        if len(steps) == settings.steps:  # the source, which both edit in one thread, is edited
+            torch.set_num_threads(2)
+
+    beside = run(scene, editor, settings=replace(settings, batch=2), report=Watched(spread), **more)
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(1)
+    assert len(in_turn.edited) == 3
+    for one, other in zip(in_turn.edited.values(), beside.edited.values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, editor, tmp_path):
     settings = replace(QUICK, **IDEAS)
     moment = int(np.random.default_rng(0).integers(5, 60))
