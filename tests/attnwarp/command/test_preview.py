@@ -239,4 +239,5 @@ def test_progress_tells_the_views_that_are_left(place):
         model, views, None, load_editor(str(place / "editor")), "red", settings, report=Told()
     )
     ends = [text.partition("; ")[2] for text in Told.texts]
-    assert ends == ["3 views to edit", "2 views to edit", "", ""]  # a batch of two
+    # A batch of two, the begin of the tuning, its iteration, the end.
+    assert ends == ["3 views to edit", "2 views to edit", "", "", ""]
