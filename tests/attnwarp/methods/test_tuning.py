@@ -88,8 +88,7 @@ def test_lifting_finds_the_colours_of_recoloured_splats_whatever_masks_hide():
     def error(colors):
         return float((colors.sh[:, 0] - goal.sh[:, 0]).abs().mean())
 
-    once, often = (error(lifted(asked, start, times)) for times in (1, 20))
-    assert 2 * often < once < 0.05 * error(start)
+    assert error(lifted(asked, start)) < 0.05 * error(start)
     member = np.arange(len(start)) % 2
     bound = lifted(asked, start, membership=member.astype(np.float64))
     assert torch.equal(bound.sh[member == 0], start.sh[member == 0])
