@@ -75,8 +75,8 @@ LIFT_ERROR = 0.03
 """Error of a pixel, of 1, up to which :meth:`Tuning.lift` counts it as right."""
 
 LEAST_WEIGHT = 1e-3
-"""Damping of splats that hardly show in any view, as a sum of their shares of pixels. From 0 to 1 all
-do as well, in edited views and in others (four drawn scenes); what hardly shows stays as it was.
+"""Damping of splats that hardly show in any view, as a sum of their shares of pixels, which then
+stay as they were. From 0 to 1 all do as well, in edited views and in others (four drawn scenes).
 """
 
 
