@@ -28,6 +28,7 @@ EDIT = (*WHOLE, "--stages", "1")
 COMMANDS = {
     "start": ("edit", "--help"),
     "whole edit": WHOLE,
+    "dinosaur": ("edit", "dinosaur", "--instruction", "make the dinosaur blue"),
     "edit": (*EDIT, "--steps", "4", "--iterations", "0"),
     "tune": (*EDIT, "--steps", "1", "--iterations", "200"),
     "fit": ("fit", "{scene}", "--iterations", "300"),
@@ -64,16 +65,20 @@ def compare(
 
 
 def table(figures: dict[str, list[list[tuple[float, float]]]]) -> str:
-    """Markdown table of medians over the rounds."""
-    lines = ["| figure | CPU s | CPU, ratio | wall, ratio | cores | equal code |", "|---" * 6 + "|"]
+    """Markdown table of medians over the rounds, and of the lowest and highest ratio."""
+    heads = "figure", "CPU s", "wall s", "CPU, ratio", "wall, ratio", "cores", "CPU, equal code"
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, rounds in figures.items():
-        cpu, wall = (statistics.median(now[k] / old[k] for old, now, _ in rounds) for k in range(2))
-        same = statistics.median(again[0] / old[0] for old, _, again in rounds)
-        spent = statistics.median(now[0] for _, now, _ in rounds)
-        cores = statistics.median(now[0] / now[1] for _, now, _ in rounds)
-        lines.append(
-            f"| {name} | {spent:.2f} | {cpu:.2f} | {wall:.2f} | {cores:.2f} | {same:.2f} |"
+        cpu, wall, same = (
+            [one[which][k] / one[0][k] for one in rounds] for which, k in ((1, 0), (1, 1), (2, 0))
         )
+        spent = [f"{statistics.median(now[k] for _, now, _ in rounds):.1f}" for k in range(2)]
+        cores = statistics.median(now[0] / now[1] for _, now, _ in rounds)
+        ratios = [
+            f"{statistics.median(x):.2f} ({min(x):.2f} to {max(x):.2f})" for x in (cpu, wall, same)
+        ]
+        cells = (name, *spent, *ratios[:2], f"{cores:.2f}", ratios[2])
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -11,5 +11,6 @@ def test_each_ratio_is_the_median_of_the_ratios_within_rounds():
     ]
     row = table({"fit": rounds}).splitlines()[2]
     assert [cell.strip() for cell in row.split("|")[1:-1]] == [
-        "fit", "16.00", "0.60", "0.40", "1.60", "1.10"
+        "fit", "16.0", "10.0", "0.60 (0.50 to 0.80)", "0.40 (0.25 to 0.50)", "1.60",
+        "1.10 (1.10 to 1.10)",
     ]  # fmt: skip
