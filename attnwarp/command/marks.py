@@ -192,22 +192,21 @@ def source_mask(
     write_marked(marks, image, mask, size, out)
     what = f"{marks.option} {typed(marks, size)}".strip()
     report.log(f"{what} marks {mask.mean():.1%} of the source view {camera.name}: {out / MARKED}")
-    if marks.at is not None or marks.words is not None:
-        warn_of_much(mask, f": look at {out / MARKED}", option=marks.option)
     if marks.at is not None:
+        warn_of_much(mask, f": look at {out / MARKED}")
         report.log(
             "if a part is missing, give --at X,Y again, on it; if too much is lit, --box or --mask"
         )
     return mask
 
 
-def warn_of_much(mask: Mask, more: str = "", option: str = "--at") -> None:
-    """Warn of a mask by a click or by words, (H, W) bool, that is hardly of one thing."""
+def warn_of_much(mask: Mask, more: str = "") -> None:
+    """Warn of a click's mask, (H, W) bool, that is hardly of one thing."""
     edges = sum(bool(line.any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
     if edges >= 2 or mask.mean() >= HARDLY:
         reached = f"reaches {edges} edges" if edges >= 2 else "covers half"
         warnings.warn(
-            f"what {option} marks {reached} of the picture, so it is hardly one thing{more}; --box"
+            f"what --at marks {reached} of the picture, so it is hardly one thing{more}; --box"
             " X0,Y0,X1,Y1 of `attnwarp edit` marks the thing by a box",
             InputWarning,
             stacklevel=3,
