@@ -16,6 +16,7 @@ from typing import TypeVar
 import torch
 
 from attnwarp.editing.editor import Editor, Latent
+from attnwarp.editing.small import thread_count
 
 T = TypeVar("T")
 
@@ -25,8 +26,10 @@ Step = Callable[[], None]
 def editors_for(editor: Editor, views: int) -> list[Editor]:
     """List an editor and copies of it on the same weights, one for each part of a batch.
 
-    There are as many as torch has threads, at most one a view; one alone on a GPU, and for an
-    editor that is not known to be safe to copy.
+    There are as many as torch has threads, at most one a view. An editor stays alone on a GPU, with
+    a large network, of which each part decodes for itself and takes the memory for it, within
+    autocast, which is of one thread, and with a network whose forward was replaced or compiled,
+    which a copy would not follow.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
@@ -35,12 +38,23 @@ def editors_for(editor: Editor, views: int) -> list[Editor]:
         >>> first is editor, any(one.network is editor.network for one in copies)
         (True, False)
     """
-    if not isinstance(editor, Latent) or editor.network.device.type != "cpu":
+    if (
+        not isinstance(editor, Latent)
+        or editor.network.device.type != "cpu"
+        or thread_count(editor) > 1
+        or torch.is_autocast_enabled("cpu")
+    ):
         return [editor]
     networks = [part for part in vars(editor).values() if isinstance(part, torch.nn.Module)]
+    replaced = {"forward", "_compiled_call_impl"}
+    if any(replaced & vars(module).keys() for part in networks for module in part.modules()):
+        return [editor]
     shared = {id(x): x for part in networks for x in (*part.parameters(), *part.buffers())}
     copies = min(views, torch.get_num_threads()) - 1
-    return [editor, *(copy.deepcopy(editor, {**shared}) for _ in range(copies))]
+    try:
+        return [editor, *(copy.deepcopy(editor, {**shared}) for _ in range(copies))]
+    except TypeError:  # a lock, a file: parts of a subclass that cannot be copied
+        return [editor]
 
 
 def parts_for(views: int, lanes: int) -> list[slice]:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -48,6 +49,23 @@ def test_copies_share_weights_but_no_hooks(two_threads):
     handle.remove()
     for own, other in zip(editor.network.parameters(), copy.network.parameters(), strict=True):
         assert own is other
+
+
+@pytest.mark.parametrize("change", ["forward", "compiled", "lock", "autocast", "low memory"])
+def test_an_editor_that_a_copy_would_not_equal_stays_alone(two_threads, change):
+    editor = load_editor("small-plain", low_memory=change == "low memory")
+    around = nullcontext()
+    if change == "forward":
+        forward = editor.unet.forward
+        editor.unet.forward = lambda *given, **named: forward(*given, **named)
+    elif change == "compiled":
+        editor.unet.compile(backend="eager")
+    elif change == "lock":
+        editor.lock = threading.Lock()
+    elif change == "autocast":
+        around = torch.autocast("cpu", torch.bfloat16)
+    with around:
+        assert editors_for(editor, 2) == [editor]
 
 
 def test_an_interrupted_part_ends_the_others(two_threads):
