@@ -36,6 +36,9 @@ AGREEING = 0.35
 """Least share of textured tiles, weighted by their agreement, that must share one similarity.
 Unrelated pictures and neighbouring views of a capture reach 0.25 at most."""
 
+SINGULAR = 1e10
+"""Condition of the normal equations from which tiles in one row leave a stretch undetermined."""
+
 FLOOR = np.array([0.03, 0.03, 3e-4, 3.5e-4])
 """Half widths (px at the working size, twice; log scale; radians) below which resampling and
 rounding to 8 bits dominate, added in quadrature."""
@@ -372,6 +375,8 @@ def _step(level: _Level, motion: Floats, radius: float, draw: np.random.Generato
             return None
         weighted = np.einsum("tki,tkl,t->til", design, inverse, weight)
         normal = np.einsum("til,tlj->ij", weighted, design)
+        if np.linalg.cond(normal) > SINGULAR:
+            return None
         change = np.linalg.solve(normal, np.einsum("til,tl->i", weighted, shift))
     scores = np.einsum("til,tl->ti", weighted, shift - design @ change)
     known = np.einsum("tki,tkl,tlj,t->ij", design, over_noise, design, weight)

@@ -12,7 +12,7 @@ from further import further
 
 from attnwarp import Gaussians
 from attnwarp.camera import Camera
-from attnwarp.drift import STRIPED, NoDrift, drift, drift_or_why
+from attnwarp.drift import STRIPED, Drift, NoDrift, drift, drift_or_why
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.change import say_drift
@@ -133,6 +133,16 @@ def test_of_pictures_that_share_nothing_the_page_says_why_no_drift_is_told(
     assert isinstance(found, NoDrift)
     line, warns = say_drift({"view": "front", "drift": vars(found)})
     assert not warns and "can't be told: " in line and why in line
+
+
+def test_tiles_in_one_row_tell_a_drift_but_no_stretch() -> None:
+    """A thing that fills a picture leaves a stripe of it."""
+    formula, left = Formula(3), np.zeros((128, 128), bool)
+    left[20:36] = True
+    found = drift_or_why(formula.picture(128), formula.picture(128, (3, 0, 0, 0)), left)
+    assert isinstance(found, Drift)
+    told = (found.right, found.down, found.scale, found.turn)
+    np.testing.assert_allclose(told, (3, 0, 0, 0), atol=0.1)
 
 
 def test_a_line_warns_of_a_moved_picture_alone() -> None:
