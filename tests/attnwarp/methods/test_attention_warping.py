@@ -415,7 +415,7 @@ def test_the_seconds_of_a_sitting_that_was_killed_are_counted_up_to_its_last_che
 
     def watch(done, total, text, left):
         nonlocal now, iterations
-        if "tuning" in text:
+        if "loss" in text:
             now, iterations = now + 1, iterations + 1
         if iterations == 5:
             raise Killed
