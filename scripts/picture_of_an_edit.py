@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot
 
+from attnwarp.cli.edit import FEWER_STEPS
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import ByViewSettings, attention_warping, by_view, preset
 from attnwarp_eval.world import splats, world
@@ -36,7 +37,7 @@ def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None
     model = splats(scene, SIZE, 0, kind="2d", count=20_000, position_noise=0.1, normal_noise=3.0)
     given = (model, cameras, before, load_editor("small-parts"), instruction)
     # The row shows edited views, so the splats need no tuning.
-    few: dict[str, Any] = {"iterations": 1, "seed": seed}
+    few: dict[str, Any] = {"iterations": 1, "seed": seed, "steps": FEWER_STEPS}
     rows: dict[str, Mapping[int, Any]] = {
         "before": dict(enumerate(before)),
         "each view alone": by_view(
