@@ -1,7 +1,7 @@
 """Parts of a batch edited side by side, each in a thread with its own copy of the editor.
 
-Layers of a small network are too short for a thread of every core: a third of the time they wait
-for each other. Views of a batch know nothing of each other, so each core edits its own.
+Layers of a small network are too short for a thread of every core, which wait for each other.
+Views of a batch know nothing of each other, so each core edits its own.
 """
 
 from __future__ import annotations

@@ -359,6 +359,9 @@ def default_of_an_edit():
     cpu, wall, cores, same = in_page("editing/whole-edit.md", WHOLE_EDIT)[1:]
     yield f"[{cpu} of its CPU seconds and {wall} of its wall seconds]"
     yield f"equal code differs by {same}. {cores} of two cores are busy"
+    row = r"\| dinosaur \| \S+ \| \S+ \| (\S+) [^|]*\| (\S+) "
+    cpu, wall = in_page("editing/whole-edit.md", row)
+    yield f"The dinosaur costs {cpu} and {wall}, in two rounds"
 
 
 def test_the_page_on_time_prints_what_the_default_of_an_edit_loses():
